@@ -14,8 +14,8 @@ import typer
 from servod.cli.common import (
     DEFAULT_SOCKET,
     JsonOption,
+    OnProgress,
     SocketOption,
-    Tell,
     example,
     need_folder,
     one_thread,
@@ -131,11 +131,11 @@ def _put(question: str) -> bool:
 
 
 @contextmanager
-def _bar(title: str, quiet: bool) -> Iterator[Tell]:
+def _bar(title: str, quiet: bool) -> Iterator[OnProgress]:
     """The progress of one step: its title, and what it is doing."""
     with contextlib.ExitStack() as stack:
-        tell = stack.enter_context(progress(title, quiet))
-        yield lambda what, share: tell(f"{title}: {what}", share)
+        on_progress = stack.enter_context(progress(title, quiet))
+        yield lambda what, share: on_progress(f"{title}: {what}", share)
 
 
 def _print(document: dict[str, Any]) -> None:

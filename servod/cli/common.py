@@ -250,11 +250,11 @@ def report(result: dict[str, Any], done: str, as_json: bool) -> None:
 
 
 #: Told what is being done, and the share of the whole that is done.
-Tell = Callable[[str, float], None]
+OnProgress = Callable[[str, float], None]
 
 
 @contextmanager
-def progress(name: str, quiet: bool) -> Iterator[Tell]:
+def progress(name: str, quiet: bool) -> Iterator[OnProgress]:
     """A bar that says what is being done; nothing when quiet."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn

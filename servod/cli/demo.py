@@ -109,14 +109,14 @@ def _run(
     fast: bool, plant: Path, seconds: float, rows: Sequence[DemoRow], recordings: Path, quiet: bool
 ) -> tuple[list[Run], list[str]]:
     """The runs, and the real-time rights that the loop was refused; none are asked for in virtual time."""
-    with _progress(quiet, seconds, rows) as tell:
+    with _progress(quiet, seconds, rows) as on_progress:
         if fast:
             from servod.qualify.demo.runs import run_fast
 
-            return run_fast(plant, seconds, rows, tell), []
+            return run_fast(plant, seconds, rows, on_progress), []
         from servod.qualify.demo.wall_clock import run_wall
 
-        return run_wall(plant, seconds, rows, recordings, tell)
+        return run_wall(plant, seconds, rows, recordings, on_progress)
 
 
 @contextmanager
@@ -133,12 +133,12 @@ def _progress(quiet: bool, seconds: float, rows: Sequence[DemoRow]) -> Iterator[
     with Progress(*columns, TimeElapsedColumn(), console=Console(stderr=True), disable=quiet) as bars:
         tasks: dict[str, TaskID] = {row.name: bars.add_task(row.label, total=seconds, start=False) for row in rows}
 
-        def tell(controller: str, share: float) -> None:
+        def on_progress(controller: str, share: float) -> None:
             if share > 0.0:
                 bars.start_task(tasks[controller])
             bars.update(tasks[controller], completed=share * seconds)
 
-        yield tell
+        yield on_progress
 
 
 def print_document(rows: Sequence[DemoRow], document: dict[str, Any]) -> None:
@@ -185,8 +185,8 @@ def demo_diagnose(plant: Path, effect: str, fast: bool, out: Path, as_json: bool
     believed, true = believed_and_true(load_rotary_model(plant), effect)
     need_folder("--out", out)
     begun = time.monotonic()
-    with sigterm_as_interrupt(), progress("demo --diagnose", quiet=as_json) as tell:
-        found = recover(believed, true, effect, stepped_axis if fast else daemon_axis, out, tell)
+    with sigterm_as_interrupt(), progress("demo --diagnose", quiet=as_json) as on_progress:
+        found = recover(believed, true, effect, stepped_axis if fast else daemon_axis, out, on_progress)
     report = write_recovery_page(found, out)
     document = found.summary() | {
         "mode": "stepped" if fast else "wall",

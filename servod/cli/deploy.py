@@ -64,11 +64,11 @@ def deploy(
         raise BadInput("--present", str(present), "only with --plant: a daemon knows what runs")
     require_certificate(wanted, accept_uncertified=None, where=str(gains))
     opened = _on_daemon(socket) if plant is None else _virtual(plant, present, config, wanted, seed)
-    with opened as axis, progress("deploy", quiet=as_json) as tell:
+    with opened as axis, progress("deploy", quiet=as_json) as on_progress:
         check_admissible(wanted, axis.config, str(gains))
         if not as_json:
             print(f"{wanted.name}: {motion_notice(wanted)}", file=sys.stderr, flush=True)
-        done = deploy(axis, wanted, tell)
+        done = deploy(axis, wanted, on_progress)
     if as_json:
         print_json(done.document())
     else:

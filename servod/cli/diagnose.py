@@ -133,7 +133,7 @@ def _print(found: Diagnosis, document: dict[str, Any], out: Path) -> None:
         print(f"recalibrated: {name} {change['from']:.5g} -> {change['to']:.5g} {change['unit']}")
     for name, windows in document.get("held_out", {}).items():
         for horizon, w in windows.items():
-            told = f"{w['before']:.3g} -> {w['after']:.3g} {w['unit']} (coasting {w['coasting']:.3g})"
-            print(f"held out: {name}: windows of {horizon} s: {told}")
+            errors = f"{w['before']:.3g} -> {w['after']:.3g} {w['unit']} (coasting {w['coasting']:.3g})"
+            print(f"held out: {name}: windows of {horizon} s: {errors}")
     model = f", {out / 'model.yaml'}" if found.evidence else ""
     print(f"written: {out / 'diagnosis.json'}{model}, {out / 'report.html'}")

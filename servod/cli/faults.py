@@ -113,24 +113,24 @@ def _of_axis(asked: _Asked) -> dict[str, Any]:
     from servod.formats.protocol import Verb
 
     try:
-        told = ask(asked.socket, Verb.FAULTS)
+        answer = ask(asked.socket, Verb.FAULTS)
         now = [fault["code"] for fault in ask(asked.socket, Verb.STATUS)["faults"]]
     except Unreachable as error:
         if not (asked.folder or _FOLDER).is_dir():
             nowhere = f"And there is no folder of recordings, {asked.folder or _FOLDER}"
             raise Unreachable(f"{error} {nowhere}; {_OTHER_FOLDER}") from None
         return _of_folder(asked) | {"daemon": str(error)}
-    rows: list[dict[str, Any]] = told["incidents"][::-1][: asked.most]
-    folder = Path(told["directory"])
+    rows: list[dict[str, Any]] = answer["incidents"][::-1][: asked.most]
+    folder = Path(answer["directory"])
     unread: list[str] = []
     if len(rows) < asked.most:
         with suppress(OSError):
-            earlier, unread = _read(folder, told["name"], asked.most, {row["file"] for row in rows})
-            rows = [*rows, *(row for row in earlier if not _told(row, rows))][: asked.most]
+            earlier, unread = _read(folder, answer["name"], asked.most, {row["file"] for row in rows})
+            rows = [*rows, *(row for row in earlier if not _is_known(row, rows))][: asked.most]
     return _document("daemon", now, rows, unread) | {"folder": str(folder)}
 
 
-def _told(row: dict[str, Any], rows: list[dict[str, Any]]) -> bool:
+def _is_known(row: dict[str, Any], rows: list[dict[str, Any]]) -> bool:
     """Whether the daemon has told of this file's incident already, before the file was written."""
     return any(row["time"] == other["time"] and row["code"] == other["code"] for other in rows)
 

@@ -26,13 +26,13 @@ def register(app: typer.Typer) -> None:
     app.command("guard-test", help=_HELP)(guard_test)
 
 
-def _end(told: int, _frame: object) -> None:
+def _end(signum: int, _frame: object) -> None:
     """Once: a second signal would break off the switching off."""
     for number in _ENDS:
         signal.signal(number, signal.SIG_IGN)
-    if told == signal.SIGINT:
+    if signum == signal.SIGINT:
         raise KeyboardInterrupt
-    sys.exit(128 + told)
+    sys.exit(128 + signum)
 
 
 def guard_test(

@@ -136,8 +136,8 @@ def draw(
         page.heading("What happened")
         rows = tuple((f"{at_s:.3f}", kind, text) for at_s, kind, text in happened[:_MOST_EVENTS])
         page.table(PageTable("Events, as the supervisor saw them", ("told at t / s", "kind", "what"), rows))
-        if beyond := len(happened) - len(rows):
-            page.sentence(f"{beyond} more events are not listed: --from-s and --to-s draw a part with its own.")
+        if unlisted := len(happened) - len(rows):
+            page.sentence(f"{unlisted} more events are not listed: --from-s and --to-s draw a part with its own.")
     page.write(file)
 
 

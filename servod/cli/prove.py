@@ -137,16 +137,16 @@ def _conceal(out: Path, trial: BlindTrial, sealed: bool) -> None:
         raise BadInput(str(out / FILE), str(there), "the same trial, or another folder")
     settings = settings_of(trial.harder, trial.engine)
     if there is None:
-        with progress("conceal", quiet=False) as tell:
+        with progress("conceal", quiet=False) as on_progress:
             make = conceal if sealed else open_cases
             drawn = plans(trial.cases, trial.seed, settings, trial.null)
-            digest = make(drawn, settings, out, lambda n, of: tell(f"concealed {n} of {of}", n / of))
+            digest = make(drawn, settings, out, lambda n, of: on_progress(f"concealed {n} of {of}", n / of))
         if digest is None:
             return
         there = replace(trial, sha256=digest)
         write_trial(out, there)
-    told = f"the truth of {trial.cases + trial.null} cases"
-    print(f"sealed: SHA-256 {there.sha256} of {told}", file=sys.stderr, flush=True)
+    sealed_truth = f"the truth of {trial.cases + trial.null} cases"
+    print(f"sealed: SHA-256 {there.sha256} of {sealed_truth}", file=sys.stderr, flush=True)
 
 
 def _diagnose(out: Path, jobs: int, time_limit: float) -> None:
@@ -167,8 +167,8 @@ def _score(out: Path, as_json: bool) -> None:
     from servod.qualify.blind.document import score, write
 
     trial = _sealed(out)
-    with progress("score", quiet=as_json) as tell:
-        document = score(trial, out, lambda n, of: tell(f"scored {n} of {of}", n / of))
+    with progress("score", quiet=as_json) as on_progress:
+        document = score(trial, out, lambda n, of: on_progress(f"scored {n} of {of}", n / of))
         write(document, out)
     if as_json:
         print_json(document)

@@ -60,8 +60,8 @@ def paper(
 
     need_folder("--out", out)
     plan = replace(QUICK if quick else PaperPlan(), seed=seed)
-    with progress("paper", quiet=as_json) as tell:
-        document = run(plan, out, tell)
+    with progress("paper", quiet=as_json) as on_progress:
+        document = run(plan, out, on_progress)
     if as_json:
         print_json(document)
     else:
@@ -140,8 +140,8 @@ def soak(
     from servod.qualify.soak.launch import Order, launch
 
     order = Order(cycles or round(hours * _MS_PER_H), seed, wall, limit_hours, out)
-    with progress("soak", quiet=as_json) as tell:
-        found = launch(order, jobs, tell)
+    with progress("soak", quiet=as_json) as on_progress:
+        found = launch(order, jobs, on_progress)
     if as_json:
         print_json(found)
     else:

@@ -157,13 +157,16 @@ def drive_report(axis: AxisModel, drive: Drive) -> list[str]:
     """What was made of the command where it is no torque, in sentences."""
     if axis.drive is None or drive.told is None:
         return []
-    told = f"torque: by the model's drive ({axis.drive.kind.value})"
+    sentence = f"torque: by the model's drive ({axis.drive.kind.value})"
     if axis.drive.kind.feeds_back:
-        told += ", its loop closed over the simulated motion"
+        sentence += ", its loop closed over the simulated motion"
     off = ~drive.told.on
     if not off.any():
-        return [told]
-    return [told, f"drive: off in {100.0 * float(off.mean()):.0f} % of the rows, from {drive.t_s[off.argmax()]:.4g} s"]
+        return [sentence]
+    return [
+        sentence,
+        f"drive: off in {100.0 * float(off.mean()):.0f} % of the rows, from {drive.t_s[off.argmax()]:.4g} s",
+    ]
 
 
 def horizon_report(recorded: Recording, horizon_s: float | None) -> list[str]:

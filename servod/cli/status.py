@@ -214,18 +214,18 @@ def _stopping_lines(document: dict[str, Any]) -> list[str]:
 
 def _promise_lines(document: dict[str, Any]) -> list[str]:
     """What of the joint is not as the running set's certificate has it; nothing where all is."""
-    told = [
+    deviations = [
         f"{row['name']} {row['share']:.2f} times the model's, certified from {row['certified'][0]:.2f} to "
         f"{row['certified'][1]:.2f}"
         for row in document["promise"]["joint"]
         if row["told"]
     ]
-    told += [
+    deviations += [
         f"RMS error {1e3 * row['rms_rad']:.3g} mrad in {row['kind']} motion, promised {1e3 * row['promised_rad']:.3g}"
         for row in document["promise"]["errors"]
         if row["told"]
     ]
-    return [f"[yellow]not as certified[/yellow] {'; '.join(told)}"] if told else []
+    return [f"[yellow]not as certified[/yellow] {'; '.join(deviations)}"] if deviations else []
 
 
 def _guard_lines(document: dict[str, Any]) -> list[str]:

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from servod.client.control import ControlClient
 
 #: Told how far a motion is: seconds since its start, and the status document's motion.
-Tell = Callable[[float, dict[str, Any]], None]
+OnProgress = Callable[[float, dict[str, Any]], None]
 
 #: The longest period that a configuration may have (servod.formats.config_wire.CycleConfig).
 LONGEST_PERIOD_US = 20_000
@@ -164,9 +164,9 @@ def _track(
             report(result, "motion started", as_json)
             return
         watched = _Watched(client, draw is not None)
-        with _progress(duration_s, as_json) as tell:
+        with _progress(duration_s, as_json) as on_progress:
             try:
-                result = _run(client, motion, watched, tell)
+                result = _run(client, motion, watched, on_progress)
             except (ServodError, KeyboardInterrupt) as error:
                 with suppress(ServodError):
                     watched.look()
@@ -292,21 +292,21 @@ def _settled_in_words(figures: dict[str, Any]) -> str:
     return f"settling time {figures['settling_s']:.3f} s after the reference had come to rest, to {band}"
 
 
-def _run(client: ControlClient, motion: dict[str, Any], watched: _Watched, tell: Tell) -> dict[str, Any]:
+def _run(client: ControlClient, motion: dict[str, Any], watched: _Watched, on_progress: OnProgress) -> dict[str, Any]:
     """Start the motion and wait for its end; whatever interrupts it stops the axis before it ends the command."""
     from servod.client.processes import sigterm_as_interrupt
 
     with sigterm_as_interrupt():
         try:
             result = client.call("track", **motion)
-            _wait_for_end(client, watched, tell)
+            _wait_for_end(client, watched, on_progress)
         except KeyboardInterrupt:
             client.call("stop")
             raise
     return result
 
 
-def _wait_for_end(client: ControlClient, watched: _Watched, tell: Tell) -> None:
+def _wait_for_end(client: ControlClient, watched: _Watched, on_progress: OnProgress) -> None:
     """Poll until the motion is over and what follows it was seen."""
     started, ended = time.monotonic(), None
     while True:
@@ -317,7 +317,7 @@ def _wait_for_end(client: ControlClient, watched: _Watched, tell: Tell) -> None:
         if abandoned := status["motion"]["abandoned"]:
             raise AnswerIsNo(abandoned)
         watched.look()
-        tell(time.monotonic() - started, status["motion"])
+        on_progress(time.monotonic() - started, status["motion"])
         if status["axis"]["motion_running"]:
             continue
         ended = ended or time.monotonic()
@@ -326,7 +326,7 @@ def _wait_for_end(client: ControlClient, watched: _Watched, tell: Tell) -> None:
 
 
 @contextmanager
-def _progress(duration_s: float, quiet: bool) -> Iterator[Tell]:
+def _progress(duration_s: float, quiet: bool) -> Iterator[OnProgress]:
     """A bar on a terminal's standard error: time, reference and error; nothing elsewhere."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn
@@ -336,10 +336,10 @@ def _progress(duration_s: float, quiet: bool) -> Iterator[Tell]:
     with Progress(*columns, console=console, disable=quiet or not console.is_terminal, transient=True) as bar:
         task = bar.add_task("", total=duration_s)
 
-        def tell(elapsed_s: float, motion: dict[str, Any]) -> None:
+        def on_progress(elapsed_s: float, motion: dict[str, Any]) -> None:
             bar.update(task, completed=min(elapsed_s, duration_s), description=_where(motion))
 
-        yield tell
+        yield on_progress
 
 
 def _where(motion: dict[str, Any]) -> str:

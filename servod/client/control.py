@@ -43,8 +43,8 @@ class RemoteBadInput(BadInput):
     def __init__(self, line: str, where: object = None, found: object = None, allowed: object = None) -> None:
         ServodError.__init__(self, line)
         parts = (where, found, allowed)
-        told = all(isinstance(part, str) for part in parts)
-        self.where, self.found, self.allowed = map(str, parts if told else ("daemon", line, ""))
+        structured = all(isinstance(part, str) for part in parts)
+        self.where, self.found, self.allowed = map(str, parts if structured else ("daemon", line, ""))
 
 
 class Refused(Unreachable):

@@ -24,7 +24,7 @@ _MOST_LATE_S, _MOST_RAMP_S = 0.25, 0.5
 #: A drive whose master has died holds its torque for so long (servod's own time-out is 150 ms).
 _MOST_DEAD_MS = 500
 #: A forged heartbeat shows when the node's own comes, this share of the period later.
-_TOLD_SHARE, _MOST_TOLD_MS = 0.4, 50.0
+_NOTICED_SHARE, _MOST_NOTICED_MS = 0.4, 50.0
 #: 0x6007: the voltage is disabled.
 _COASTS = 2
 #: One count that looks like more than this share of the speed limit makes a joint trip far below it.
@@ -41,10 +41,10 @@ _MOST_MISMATCH_RAD = math.pi / 4.0
 
 def weakened(config: AxisConfig, model: AxisModel | None = None) -> list[str]:
     """One line for each value of `config` (after `with_expected`) that guards less than it seems, key first."""
-    lines = [*_limits(config), *_watches(config), *_times(config), *_reactions(config), *_beyond_drive(config)]
+    lines = [*_limits(config), *_watches(config), *_times(config), *_reactions(config), *_above_drive(config)]
     lines += warnings(config)
     if model is not None and model.axis is AxisKind.ROTARY:
-        lines += [*_beyond_model(config, model), *contradictions(config, model)]
+        lines += [*_above_model(config, model), *contradictions(config, model)]
     if config.gains.accept_uncertified:
         lines.append("gains.accept_uncertified is true: a gain set that nobody verified, or of another drive, may run")
     if config.recorder.history_s == 0.0:
@@ -174,11 +174,11 @@ def _times(config: AxisConfig) -> list[str]:
             f"stopping.within_s {config.stopping.within_s:g}: torque may act for so long after a loss of the master; "
             f"up to {_MOST_WITHIN_S:g} s is usual"
         )
-    told_ms = _TOLD_SHARE * config.heartbeat.node_period_ms
-    if told_ms > _MOST_TOLD_MS:
+    noticed_ms = _NOTICED_SHARE * config.heartbeat.node_period_ms
+    if noticed_ms > _MOST_NOTICED_MS:
         lines.append(
             f"heartbeat.node_period_ms {config.heartbeat.node_period_ms}: a heartbeat that somebody else sends for a "
-            f"node is told up to {told_ms / 1e3:g} s later"
+            f"node is told up to {noticed_ms / 1e3:g} s later"
         )
     dead_ms = config.heartbeat.drive_timeout_ms
     if dead_ms > _MOST_DEAD_MS:
@@ -189,7 +189,7 @@ def _times(config: AxisConfig) -> list[str]:
     return lines
 
 
-def _beyond_drive(config: AxisConfig) -> list[str]:
+def _above_drive(config: AxisConfig) -> list[str]:
     rated_mnm = config.amplifier.rated_torque_mnm
     if rated_mnm is None:
         return []
@@ -201,7 +201,7 @@ def _beyond_drive(config: AxisConfig) -> list[str]:
     ]
 
 
-def _beyond_model(config: AxisConfig, model: AxisModel) -> list[str]:
+def _above_model(config: AxisConfig, model: AxisModel) -> list[str]:
     limits, lines = config.limits, []
     saturation = model.torque_saturation
     if saturation is not None:

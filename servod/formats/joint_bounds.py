@@ -24,7 +24,7 @@ _NOT_RECKONED = (
     *("offset_drift", "residual", "backlash", "joint_elasticity"),
 )
 #: Loads over position are looked at in so many places of the range.
-_PLACES = 256
+_POSITIONS = 256
 
 
 @dataclass(frozen=True)
@@ -54,16 +54,16 @@ def joint_of(config: AxisConfig) -> JointBounds | None:
 
     Raises BadInput when a file that is named cannot be read.
     """
-    told = config.stopping
+    stated = config.stopping
     model, source = _model(config)
     rough = config.wiring_proof.inertia
     nominal = model.inertia if model is not None else rough
-    if nominal is None and told.least_inertia is None and told.most_inertia is None:
+    if nominal is None and stated.least_inertia is None and stated.most_inertia is None:
         return None
     varies = sum(abs(wave.amplitude) for wave in model.position_dependent_inertia.harmonics) if (
         model is not None and model.position_dependent_inertia is not None
     ) else 0.0  # fmt: skip
-    least, most = told.least_inertia, told.most_inertia
+    least, most = stated.least_inertia, stated.most_inertia
     if nominal is not None:
         least = least or nominal * (1.0 - varies) * (1.0 - _INERTIA_SHARE)
         most = most or max(nominal * (1.0 + varies) * (1.0 + _INERTIA_SHARE), least)
@@ -74,20 +74,20 @@ def joint_of(config: AxisConfig) -> JointBounds | None:
     rough_nm = _FRICTION_SHARE * (config.wiring_proof.friction_nm or 0.0)
     friction_nm, viscous = (rough_nm, 0.0) if model is None else _least_friction(model)
     assumed = []
-    if model is None and told.least_friction_nm is None and not rough_nm:
+    if model is None and stated.least_friction_nm is None and not rough_nm:
         assumed.append("assumed: no friction (stopping.least_friction_nm)")
-    if model is None and told.load_min_nm is None and told.load_max_nm is None:
+    if model is None and stated.load_min_nm is None and stated.load_max_nm is None:
         assumed.append("assumed: no load (stopping.load_min_nm, load_max_nm)")
-    if nominal is None or None not in (told.least_inertia, told.most_inertia):
+    if nominal is None or None not in (stated.least_inertia, stated.most_inertia):
         source = "the section stopping states it"
-    elif told.model_fields_set & _OF_THE_JOINT:
+    elif stated.model_fields_set & _OF_THE_JOINT:
         source += ", but for what the section stopping states"
     path = _TorquePath.of(model, config)
-    inertias_nm = (least, most, friction_nm if told.least_friction_nm is None else told.least_friction_nm)
+    inertias_nm = (least, most, friction_nm if stated.least_friction_nm is None else stated.least_friction_nm)
     loads_nm = (
-        viscous if told.least_viscous is None else told.least_viscous,
-        low_nm if told.load_min_nm is None else told.load_min_nm,
-        high_nm if told.load_max_nm is None else told.load_max_nm,
+        viscous if stated.least_viscous is None else stated.least_viscous,
+        low_nm if stated.load_min_nm is None else stated.load_min_nm,
+        high_nm if stated.load_max_nm is None else stated.load_max_nm,
     )
     least, most, friction_nm, viscous, low_nm, high_nm = (x / path.factor for x in (*inertias_nm, *loads_nm))
     return JointBounds(
@@ -138,15 +138,15 @@ class _TorquePath(NamedTuple):
 
 def contradictions(config: AxisConfig, model: AxisModel) -> list[str]:
     """What the section `stopping` says of a better joint than the model, in sentences."""
-    told, (low_nm, high_nm) = config.stopping, _loads(model, config)
+    stated, (low_nm, high_nm) = config.stopping, _loads(model, config)
     dry_nm, viscous = (value / _FRICTION_SHARE for value in _least_friction(model))
     rows = (
-        ("least_inertia", told.least_inertia, model.inertia, 1.0),
-        ("most_inertia", told.most_inertia, model.inertia, -1.0),
-        ("least_friction_nm", told.least_friction_nm, dry_nm, 1.0),
-        ("least_viscous", told.least_viscous, viscous, 1.0),
-        ("load_min_nm", told.load_min_nm, low_nm, 1.0),
-        ("load_max_nm", told.load_max_nm, high_nm, -1.0),
+        ("least_inertia", stated.least_inertia, model.inertia, 1.0),
+        ("most_inertia", stated.most_inertia, model.inertia, -1.0),
+        ("least_friction_nm", stated.least_friction_nm, dry_nm, 1.0),
+        ("least_viscous", stated.least_viscous, viscous, 1.0),
+        ("load_min_nm", stated.load_min_nm, low_nm, 1.0),
+        ("load_max_nm", stated.load_max_nm, high_nm, -1.0),
     )
     return [
         f"stopping.{key} {value:g}: the model has {of_model:.3g}; the stopping distance is that of a better joint"
@@ -187,8 +187,8 @@ def _loads(model: AxisModel, config: AxisConfig) -> tuple[float, float]:
     low, span = config.limits.position_min_rad, config.limits.position_max_rad - config.limits.position_min_rad
     either_nm = sum(abs(wave.amplitude) for wave in model.cogging.harmonics) if model.cogging is not None else 0.0
     found = [0.0]
-    for n in range(_PLACES + 1):
-        x, load_nm = low + span * n / _PLACES, model.torque_offset
+    for n in range(_POSITIONS + 1):
+        x, load_nm = low + span * n / _POSITIONS, model.torque_offset
         if model.gravity is not None:
             load_nm -= model.gravity.amplitude * math.sin(x + model.gravity.phase)
         if model.spring is not None:

@@ -249,12 +249,12 @@ def _facts(config: AxisConfig, joint: JointBounds, reaction_s: float, writes_ram
 def _ramp(config: AxisConfig, most_rad_s2: float, writes_ramp: bool) -> float:
     """The drive's deceleration after a loss of the master; 0 where its options switch the torque off, and where nobody
     knows its ramp: one that is too gentle is worse than none by time only, and the way is that of coasting at most."""
-    option, told = config.amplifier.quick_stop_option, config.stopping.deceleration_rad_s2
+    option, stated_rad_s2 = config.amplifier.quick_stop_option, config.stopping.deceleration_rad_s2
     if config.amplifier.heartbeat_reaction == _REACTS_OFF or option == _OFF:
         return 0.0
     kind = option - 4 if quick_stop_stays(option) else option
-    if told is not None:
-        return min(told, most_rad_s2)
+    if stated_rad_s2 is not None:
+        return min(stated_rad_s2, most_rad_s2)
     if kind in _RAMPS and not writes_ramp:
         return 0.0
     return _RAMP_SHARE * most_rad_s2 if kind in (*_RAMPS, _CURRENT_LIMIT) else 0.0

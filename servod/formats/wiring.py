@@ -13,7 +13,7 @@ from servod.formats.config_wire import QUICK_STOP_STAYS, quick_stop_stays
 from servod.formats.model.axis_model import AxisKind, AxisModel, load_axis_model
 
 #: Places within the position limits at which a load is looked at.
-_PLACES = 200
+_POSITIONS = 200
 
 
 def with_expected(config: AxisConfig) -> AxisConfig:
@@ -70,8 +70,8 @@ def load_nm(model: AxisModel, config: AxisConfig) -> float:
     """The largest torque that gravity and torque_offset of the model put on the joint within the position limits."""
     low, high = config.limits.position_min_rad, config.limits.position_max_rad
     amplitude, phase = (model.gravity.amplitude, model.gravity.phase) if model.gravity else (0.0, 0.0)
-    places = (low + (high - low) * k / _PLACES for k in range(_PLACES + 1))
-    return max(abs(amplitude * math.sin(place + phase) + model.torque_offset) for place in places)
+    positions = (low + (high - low) * k / _POSITIONS for k in range(_POSITIONS + 1))
+    return max(abs(amplitude * math.sin(position + phase) + model.torque_offset) for position in positions)
 
 
 def brake_notes(config: AxisConfig) -> list[str]:

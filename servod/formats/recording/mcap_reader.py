@@ -119,7 +119,7 @@ def read_recording(
         with open_file(path) as stream:
             bounded = _Bounded(stream)
             _read_stream(_reader(bounded), taker)
-            _tell_damage(recording, taker, bounded)
+            _note_damage(recording, taker, bounded)
             recording.sha256 = bounded.sha256()
     except InvalidMagic:
         raise BadInput(str(path), "a file that is not MCAP", "a recording of servod (.mcap)") from None
@@ -209,7 +209,7 @@ class _Bounded:
         return self._hash.hexdigest()
 
 
-def _tell_damage(recording: McapRecording, taker: _Taker, bounded: _Bounded) -> None:
+def _note_damage(recording: McapRecording, taker: _Taker, bounded: _Bounded) -> None:
     """Say where a file that has no end breaks off, and what one has lost whose index promises more cycles."""
     if recording.truncated:
         promised, left_out = taker.promised, taker.chunks_left_out

@@ -229,12 +229,12 @@ class ChunkedWriter:
             uncompressed_size=len(self._chunk),
         )
         at, length = self._write(chunk)
-        end, places = at + length, {}
+        end, offsets = at + length, {}
         for channel, entries in self._entries.items():
             size = 8 * len(entries)
             index = struct.pack(f"<BQHI{len(entries)}Q", Opcode.MESSAGE_INDEX, 6 + size, channel, size, *entries)
             self._emit(index)
-            places[channel] = end
+            offsets[channel] = end
             end += len(index)
         chunk_index = ChunkIndex(
             chunk_length=length,
@@ -243,7 +243,7 @@ class ChunkedWriter:
             compressed_size=len(chunk.data),
             message_end_time=last_ns,
             message_index_length=end - at - length,
-            message_index_offsets=places,
+            message_index_offsets=offsets,
             message_start_time=first_ns,
             uncompressed_size=chunk.uncompressed_size,
         )
