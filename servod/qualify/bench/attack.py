@@ -80,10 +80,10 @@ def _round(axis: RunningAxis, record: Path, log: Path, quiet_s: float, attack_s:
         if attackers.poll() is not None:
             raise AnswerIsNo(f"the attackers ended before the attack: {log.read_text(encoding='utf-8')[-500:]}")
         growth_mib = (resident_kib(daemon_pid) - before_kib) / _KIB_PER_MIB
-    return _Round(quiet, attacked, quiet_ms, times_ms, growth_mib, told(log))
+    return _Round(quiet, attacked, quiet_ms, times_ms, growth_mib, read_tallies(log))
 
 
-def told(log: Path) -> dict[str, AttackTally]:
+def read_tallies(log: Path) -> dict[str, AttackTally]:
     """What each kind of attack did, from what the attackers said at their end.
 
     Raises AnswerIsNo when they said nothing, or when an attack did not take place.

@@ -78,16 +78,16 @@ THOROUGH = BenchSettings(3.0, 10, 20_000, 60.0, 600.0, 20.0, 300.0, plants=1000,
 QUICK = BenchSettings(1.5, 6, 5_000, 10.0, 20.0, 4.0, 60.0, plants=100)
 
 
-def measure(plan: BenchSettings, tell: Callable[[str], None]) -> dict[str, Any]:
-    """Measure everything, one after the other, so that nothing disturbs anything; `tell` hears what is going on."""
-    tell("wake-up against cyclictest")
+def measure(plan: BenchSettings, on_progress: Callable[[str], None]) -> dict[str, Any]:
+    """Measure everything, one after the other, so that nothing disturbs anything; `on_progress` hears what goes on."""
+    on_progress("wake-up against cyclictest")
     woken = wakeup.measure(plan.wakeup_s, plan.wakeup_rounds)
-    tell("work of one cycle")
+    on_progress("work of one cycle")
     ticks, controller = tick.measure(plan.ticks)
-    tell(f"two processes on the wall clock, {plan.wall_clock_s + plan.memory_s:.0f} s")
+    on_progress(f"two processes on the wall clock, {plan.wall_clock_s + plan.memory_s:.0f} s")
     wall_clock, memory = wall.measure(plan.wall_clock_s, plan.memory_s)
-    synthesis, verification = _laboratory(plan, tell)
-    tell("stepped and simulated speed")
+    synthesis, verification = _laboratory(plan, on_progress)
+    on_progress("stepped and simulated speed")
     return {
         "machine": machine(),
         "wakeup": woken,
@@ -99,23 +99,23 @@ def measure(plan: BenchSettings, tell: Callable[[str], None]) -> dict[str, Any]:
         "memory": memory,
         "synthesis": synthesis,
         "verification": verification,
-        "commission": _commission(plan, tell),
+        "commission": _commission(plan, on_progress),
     }
 
 
 def _laboratory(
-    plan: BenchSettings, tell: Callable[[str], None]
+    plan: BenchSettings, on_progress: Callable[[str], None]
 ) -> tuple[dict[str, Any] | None, dict[str, Any] | None]:
     if not plan.plants:
         return None, None
-    tell(f"synthesis, and a certificate with {plan.plants} plants")
+    on_progress(f"synthesis, and a certificate with {plan.plants} plants")
     return measure_lab(plan.plants)
 
 
-def _commission(plan: BenchSettings, tell: Callable[[str], None]) -> dict[str, Any] | None:
+def _commission(plan: BenchSettings, on_progress: Callable[[str], None]) -> dict[str, Any] | None:
     if not plan.commission:
         return None
-    tell("a whole commissioning, four minutes")
+    on_progress("a whole commissioning, four minutes")
     return commission()
 
 

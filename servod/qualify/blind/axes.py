@@ -55,14 +55,14 @@ class Motions:
     def moves(self, rng: np.random.Generator, seconds: float = 16.0) -> Array:
         """From place to place in short and long moves, with rests."""
         t = times(seconds)
-        made, now, place = np.zeros(len(t)), 0.3, 0.0
+        made, now, position = np.zeros(len(t)), 0.3, 0.0
         while now < seconds:
             goal = self.travel * rng.uniform(-1.0, 1.0)
-            far = abs(goal - place) / self.travel
+            far = abs(goal - position) / self.travel
             lasts = (0.12 + 0.35 * math.sqrt(far)) * rng.uniform(0.8, 2.5) / self.tempo
-            made += (goal - place) * quintic((t - now) / lasts)
+            made += (goal - position) * quintic((t - now) / lasts)
             now += lasts + rng.choice([0.05, 0.4, 0.9]) * rng.uniform(0.5, 1.5)
-            place = goal
+            position = goal
         return made
 
     def mixed(self, rng: np.random.Generator, seconds: float = 12.0) -> Array:

@@ -149,7 +149,7 @@ def make_case(plan: CaseSpec, settings: Settings) -> Case:
         believed = _absorbing(believed, axis, physics, rng)
     off = rng.uniform(-OFF, OFF, 8).tolist() if plan.off else [0.0] * 8
     truth = _truth(plan, settings, axis, hidden, seen) | {
-        "params": _told(plant),
+        "params": _own_numbers(plant),
         "true_model": true_model(physics, [c.model for c in hidden]),
     }
     recordings = record(plant, recorder, hidden, rng, references(axis, motions))
@@ -294,7 +294,7 @@ def _cluttered(physics: Physics, axis: CaseAxis, rng: np.random.Generator, effec
     return physics
 
 
-def _told(plant: Physics) -> dict[str, float]:
+def _own_numbers(plant: Physics) -> dict[str, float]:
     """Numbers of the plant that are not those of one that has nothing."""
     nothing = Physics()._asdict()
     return {key: float(value) for key, value in plant._asdict().items() if value != nothing[key]}
@@ -324,12 +324,12 @@ def _truth(
 
 
 #: Told how many cases are made of how many.
-Tell = Callable[[int, int], None]
+OnProgress = Callable[[int, int], None]
 
 CASES, SEALED, TRUTH, HOLDOUT = "cases", "sealed", "truth.json", "holdout"
 
 
-def conceal(plans: Sequence[CaseSpec], settings: Settings, out: Path, tell: Tell) -> str:
+def conceal(plans: Sequence[CaseSpec], settings: Settings, out: Path, on_progress: OnProgress) -> str:
     """Write folders into `out`/cases and the truth into `out`/sealed; returns the truth's SHA-256."""
     truths = {}
     for number, plan in enumerate(plans):
@@ -337,7 +337,7 @@ def conceal(plans: Sequence[CaseSpec], settings: Settings, out: Path, tell: Tell
         case = make_case(plan, settings)
         truths[name] = case.truth
         write_case(case, out / CASES / name, out / SEALED / name)
-        tell(number + 1, len(plans))
+        on_progress(number + 1, len(plans))
     whole = {"salt": secrets.token_hex(16), "cases": truths}
     content = (json.dumps(whole, indent=1, allow_nan=False) + "\n").encode()
     write_bytes(out / SEALED / TRUTH, content)
@@ -345,14 +345,14 @@ def conceal(plans: Sequence[CaseSpec], settings: Settings, out: Path, tell: Tell
     return hashlib.sha256(content).hexdigest()
 
 
-def open_cases(plans: Sequence[CaseSpec], settings: Settings, out: Path, tell: Tell) -> None:
+def open_cases(plans: Sequence[CaseSpec], settings: Settings, out: Path, on_progress: OnProgress) -> None:
     """Write folders with everything in them, truth.yaml as well, for whoever develops a diagnosis."""
     for number, plan in enumerate(plans):
         case = make_case(plan, settings)
         folder = out / f"c{number:03d}"
         write_case(case, folder, folder)
         write_bytes(folder / "truth.yaml", yaml.safe_dump(case.truth, sort_keys=False).encode())
-        tell(number + 1, len(plans))
+        on_progress(number + 1, len(plans))
 
 
 def write_case(case: Case, folder: Path, held: Path) -> None:

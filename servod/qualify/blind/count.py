@@ -99,7 +99,7 @@ def _errors(true: Sequence[Parameter]) -> Document:
         return {"parameters": 0, "missing": 0, "median_error": None, "covered": None}
     error = float(np.median([parameter.error for parameter in true]))
     covered = float(np.mean([parameter.covered for parameter in true]))
-    missing = sum(not parameter.told for parameter in true)
+    missing = sum(not parameter.reported for parameter in true)
     counted = {"parameters": len(true), "missing": missing}
     return counted | {"median_error": round(error, 5), "covered": round(covered, 4)}
 

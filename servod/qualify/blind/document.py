@@ -136,12 +136,12 @@ def calibration(found: Mapping[str, Any]) -> Drawn:
 
 
 #: Told how many cases are scored of how many.
-Tell = Callable[[int, int], None]
+OnProgress = Callable[[int, int], None]
 
 PICTURES = "pictures"
 
 
-def score(trial: BlindTrial, out: Path, tell: Tell) -> dict[str, Any]:
+def score(trial: BlindTrial, out: Path, on_progress: OnProgress) -> dict[str, Any]:
     """Open the seal of the trial in `out` and score all answers.
 
     Raises BadInput when it is not what was sealed, or when not all answers are of one diagnosis.
@@ -154,7 +154,7 @@ def score(trial: BlindTrial, out: Path, tell: Tell) -> dict[str, Any]:
     cases = []
     for number, (name, true) in enumerate(sorted(truth.items())):
         cases.append(score_case(out, name, true))
-        tell(number + 1, len(truth))
+        on_progress(number + 1, len(truth))
     return document(trial, cases)
 
 
@@ -208,7 +208,7 @@ def _row(case: Scored) -> dict[str, Any]:
         "named": {guess.effect: guess.confidence for guess in case.guesses},
         "right": case.right,
         "parameters": [
-            {"effect": p.effect, "name": p.name, "error": round(p.error, 5), "covered": p.covered, "told": p.told}
+            {"effect": p.effect, "name": p.name, "error": round(p.error, 5), "covered": p.covered, "told": p.reported}
             for p in case.parameters
         ],
         "held_out_rad": {key: None if math.isnan(value) else value for key, value in held.items()},

@@ -64,16 +64,16 @@ def _body(parent: ET.Element, name: str, inertia: float, load: Physics | None) -
     body = ET.SubElement(parent, "body", name=name)
     joint = ET.SubElement(body, "joint", name=name, axis="0 1 0", armature=_n(_ROTOR * inertia))
     rest = (1.0 - _ROTOR) * inertia
-    mass, place, own = 1.0, (0.0, 0.0, 0.0), rest
+    mass, centre, own = 1.0, (0.0, 0.0, 0.0), rest
     if load is not None and load.gravity != 0.0:
         own = (1.0 - _HANGS) * rest
         mass = load.gravity**2 / (_GRAVITY_M_S2**2 * _HANGS * rest)
         length = load.gravity / (mass * _GRAVITY_M_S2)
-        place = (-length * math.sin(load.gravity_phase), 0.0, -length * math.cos(load.gravity_phase))
+        centre = (-length * math.sin(load.gravity_phase), 0.0, -length * math.cos(load.gravity_phase))
     if load is not None and load.spring > 0.0:
         joint.set("stiffness", _n(load.spring))
         joint.set("springref", _n(load.spring_rest))
-    ET.SubElement(body, "inertial", pos=_n(*place), mass=_n(mass), diaginertia=_n(own, own, own))
+    ET.SubElement(body, "inertial", pos=_n(*centre), mass=_n(mass), diaginertia=_n(own, own, own))
     return body
 
 

@@ -26,7 +26,7 @@ from servod.common.sources import DIAGNOSES, sha256_on_disk
 from servod.qualify.blind.conceal import CASES, lock
 
 #: Told the case that was diagnosed last, how many are done and how many there are.
-Tell = Callable[[str, int, int], None]
+OnProgress = Callable[[str, int, int], None]
 
 ANSWERS, RUN, DIAGNOSIS, MODEL, SAID = "answers", "run.json", "diagnosis.json", "model.yaml", "said.txt"
 
@@ -56,7 +56,7 @@ class Examiner:
         self._ended = False
         self._sources = sha256_on_disk(DIAGNOSES)
 
-    def run(self, jobs: int, tell: Tell) -> None:
+    def run(self, jobs: int, on_progress: OnProgress) -> None:
         """Diagnose all cases that have no answer. An interrupt ends what runs and keeps what is done.
 
         Raises BadInput when what is done was done by other sources, or when the sources change meanwhile.
@@ -66,25 +66,25 @@ class Examiner:
         answered = [name for name in names if (self._out / ANSWERS / name / RUN).exists()]
         one_diagnosis(self._out, answered, self._sources)
         open_cases, done = sorted(set(names) - set(answered)), len(answered)
-        with self._crew(jobs) as crew:
-            pending: dict[Future[None], str] = {crew.submit(self._examine, name): name for name in open_cases}
+        with self._workers(jobs) as pool:
+            pending: dict[Future[None], str] = {pool.submit(self._examine, name): name for name in open_cases}
             for job in as_completed(pending):
                 job.result()
                 done += 1
-                tell(pending[job], done, len(names))
+                on_progress(pending[job], done, len(names))
 
     @contextmanager
-    def _crew(self, jobs: int) -> Iterator[ThreadPoolExecutor]:
+    def _workers(self, jobs: int) -> Iterator[ThreadPoolExecutor]:
         """Threads that wait for processes; whatever ends the block ends these."""
-        crew = ThreadPoolExecutor(jobs)
+        pool = ThreadPoolExecutor(jobs)
         try:
-            yield crew
+            yield pool
         finally:
             with self._lock:
                 self._ended = True
                 for process in self._running:
                     process.terminate()
-            crew.shutdown(cancel_futures=True)
+            pool.shutdown(cancel_futures=True)
 
     def _examine(self, name: str) -> None:
         """Diagnose a copy of a case in a folder where there is nothing else, then fetch the answer."""

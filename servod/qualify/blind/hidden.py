@@ -28,10 +28,10 @@ def backlash(draw: Draw) -> Concealed:
     if draw.other:
         changes["joint_cubic"] = 2.0 * stiffness / gap**2
     group = {"gap": gap, "load_inertia": load, "stiffness": stiffness, "damping": damping}
-    told = {"gap": gap, "load_inertia": load}
+    parameters = {"gap": gap, "load_inertia": load}
     believed = {"inertia": p.inertia, "viscous": p.viscous}
     model = None if draw.other else {listed.BACKLASH: group | {"load_viscous": changes["load_viscous"]}}
-    return Concealed(changes, told, model, believed)
+    return Concealed(changes, parameters, model, believed)
 
 
 def joint_elasticity(draw: Draw) -> Concealed:
@@ -46,10 +46,10 @@ def joint_elasticity(draw: Draw) -> Concealed:
     cubic = 0.5 * stiffness / bend**2 if draw.other else 0.0
     changes = _split(draw, load) | {"joint_stiffness": stiffness, "joint_damping": damping, "joint_cubic": cubic}
     group = {"load_inertia": load, "stiffness": stiffness, "damping": damping, "cubic": cubic}
-    told = {"load_inertia": load, "stiffness": stiffness}
+    parameters = {"load_inertia": load, "stiffness": stiffness}
     believed = {"inertia": p.inertia, "viscous": p.viscous}
     model = {listed.JOINT_ELASTICITY: group | {"load_viscous": changes["load_viscous"]}}
-    return Concealed(changes, told, model, believed)
+    return Concealed(changes, parameters, model, believed)
 
 
 def _split(draw: Draw, load: float) -> dict[str, float]:
@@ -122,8 +122,8 @@ def disturbance(draw: Draw) -> Concealed:
     torque, start = draw.size(0.3, 1.0) * draw.physics.coulomb * draw.sign(), draw.between(2.0, 9.0)
     lasts, shape = draw.between(0.8, 3.0), draw.one_of(1.0, 2.0) if draw.other else 0.0
     changes = {"push": torque, "push_start_s": start, "push_end_s": start + lasts, "push_shape": shape}
-    told = {} if draw.other else {"start_s": start, "end_s": start + lasts, "torque": torque}
-    return Concealed(changes, told, None if draw.other else {}, only=int(draw.one_of(0.0, 1.0, 2.0)))
+    parameters = {} if draw.other else {"start_s": start, "end_s": start + lasts, "torque": torque}
+    return Concealed(changes, parameters, None if draw.other else {}, only=int(draw.one_of(0.0, 1.0, 2.0)))
 
 
 # --- Over position ---------------------------------------------------------------------------------------------------
@@ -190,8 +190,8 @@ def spring(draw: Draw) -> Concealed:
     cubic = 0.8 * stiffness / travel**2 if draw.other else 0.0
     found = {"stiffness": stiffness, "rest": rest, "cubic": cubic}
     changes = {"spring": stiffness, "spring_rest": rest, "spring_cubic": cubic}
-    told = found if draw.other else {key: found[key] for key in ("stiffness", "rest")}
-    return Concealed(changes, told, {listed.SPRING: found}, travel=0.9 if draw.other else 1.2)
+    parameters = found if draw.other else {key: found[key] for key in ("stiffness", "rest")}
+    return Concealed(changes, parameters, {listed.SPRING: found}, travel=0.9 if draw.other else 1.2)
 
 
 def position_dependent_inertia(draw: Draw) -> Concealed:

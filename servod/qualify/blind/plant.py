@@ -120,8 +120,8 @@ def bristle(p: Physics, z: float, velocity: float, dry: float) -> float:
     goal = math.copysign(most, velocity)
     share = 1.0
     if p.elastic_share > 0.0 and z * velocity > 0.0:
-        beyond = (abs(z) / most - p.elastic_share) / (1.0 - p.elastic_share)
-        share = 0.0 if beyond <= 0.0 else min(0.5 - 0.5 * math.cos(math.pi * beyond), 1.0) if beyond < 1.0 else 1.0
+        plastic = (abs(z) / most - p.elastic_share) / (1.0 - p.elastic_share)
+        share = 0.0 if plastic <= 0.0 else min(0.5 - 0.5 * math.cos(math.pi * plastic), 1.0) if plastic < 1.0 else 1.0
     elif p.elastic_share > 0.0:
         share = 0.0
     if share < 1e-9:

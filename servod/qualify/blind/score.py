@@ -53,7 +53,7 @@ class Parameter:
     name: str
     error: float
     covered: bool
-    told: bool = True
+    reported: bool = True
 
 
 @dataclass(frozen=True)
@@ -133,12 +133,12 @@ def parameters_of(finding: Mapping[str, Any], truth: Mapping[str, Any]) -> list[
     true: Mapping[str, float] = truth["parameters"][finding["effect"]]
     found = []
     for name, value in true.items():
-        told = finding["parameters"].get(name)
-        if told is None:
-            found.append(Parameter(finding["effect"], name, 1.0, covered=False, told=False))
+        fitted = finding["parameters"].get(name)
+        if fitted is None:
+            found.append(Parameter(finding["effect"], name, 1.0, covered=False, reported=False))
             continue
-        off = float(told["value"]) - value
-        low, high = (float(bound) - value for bound in told["interval"])
+        off = float(fitted["value"]) - value
+        low, high = (float(bound) - value for bound in fitted["interval"])
         if name == "phase":
             turns = 2.0 * math.pi * round(off / (2.0 * math.pi))
             off, low, high = off - turns, low - turns, high - turns

@@ -72,10 +72,11 @@ def results(found: Mapping[str, Any]) -> PageTable:
     ]
     if found["unexplained"]["cases"]:
         rows.append(_counted("of these: found, and called unexplained", found["unexplained"], None))
-    told = found["parameters"]["all"]
-    size = f"{told['parameters']} values, {told['missing']} of them not told"
-    rows.append(_figure("parameters: median error", told["median_error"], size, MOST_ERROR, percent))
-    rows.append(_figure("parameters: 95 % intervals that cover", told["covered"], size, LEAST_COVERED, percent, "≥"))
+    parameters = found["parameters"]["all"]
+    size = f"{parameters['parameters']} values, {parameters['missing']} of them not told"
+    rows.append(_figure("parameters: median error", parameters["median_error"], size, MOST_ERROR, percent))
+    covered = parameters["covered"]
+    rows.append(_figure("parameters: 95 % intervals that cover", covered, size, LEAST_COVERED, percent, "≥"))
     rows += _held_out(found["held_out"])
     for key, text in _SPENT.items():
         spread = found["times"][key]
@@ -112,11 +113,11 @@ def effects(found: Mapping[str, Any]) -> PageTable:
     """For each effect: named how often, parameters, and as what it was mistaken."""
     rows = []
     for effect, counted in found["by_effect"].items():
-        told = found["parameters"]["by_effect"].get(effect, {"median_error": None, "covered": None})
+        parameters = found["parameters"]["by_effect"].get(effect, {"median_error": None, "covered": None})
         others = {name: n for name, n in found["confusion"][effect].items() if name != effect}
         mistaken = ", ".join(f"{name} {n}" for name, n in sorted(others.items(), key=lambda item: -item[1]))
         named = f"{counted['right']}/{counted['cases']}"
-        rows.append((effect, named, percent(told["median_error"]), percent(told["covered"]), mistaken))
+        rows.append((effect, named, percent(parameters["median_error"]), percent(parameters["covered"]), mistaken))
     header = ("effect", "named", "median error of parameters", "intervals that cover", "beside it or instead")
     return PageTable(EFFECTS, header, tuple(rows))
 

@@ -56,8 +56,8 @@ def margins(gains: GainSet) -> Margins | None:
     if certificate is None or design is None or gains.certificate_problem() is not None:
         return None
     checks = {check.name: check.value for check in certificate.checks}
-    told = certificate.observations
-    if not {_PLANTS, _DISK} <= checks.keys() or not {_DELAY, _FRICTION, *_INERTIA} <= told.keys():
+    observations = certificate.observations
+    if not {_PLANTS, _DISK} <= checks.keys() or not {_DELAY, _FRICTION, *_INERTIA} <= observations.keys():
         return None  # of another version of the checks
     alpha = checks[_DISK]  # gain by (2 + alpha)/(2 - alpha), phase by 2*atan(alpha/2): Seiler, Packard, Gahinet 2020
     return Margins(
@@ -65,9 +65,9 @@ def margins(gains: GainSet) -> Margins | None:
         gain_margin_db=20.0 * math.log10((2.0 + alpha) / (2.0 - alpha)),
         phase_margin_deg=math.degrees(2.0 * math.atan(0.5 * alpha)),
         delay_ms=1e3 * design.model.total_delay_s,
-        tolerated_delay_ms=1e3 * told[_DELAY],
-        tolerated_inertia=(told[_INERTIA[0]], told[_INERTIA[1]]),
-        tolerated_friction=told[_FRICTION],
+        tolerated_delay_ms=1e3 * observations[_DELAY],
+        tolerated_inertia=(observations[_INERTIA[0]], observations[_INERTIA[1]]),
+        tolerated_friction=observations[_FRICTION],
     )
 
 

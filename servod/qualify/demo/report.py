@@ -147,10 +147,10 @@ def _errors(
     every: Sequence[tuple[DemoRow, Run]],
     scores: Mapping[str, float],
 ) -> Figure:
-    places = {row.name: place for place, (row, _) in enumerate(every)}
+    indices = {row.name: index for index, (row, _) in enumerate(every)}
     curves = tuple(
-        curve(row.label, run.time_s, run.error_mrad, COLOURS[places[row.name] % len(COLOURS)], width=1.0,
-              style=Style.LINE if places[row.name] < len(COLOURS) else Style.DASHED)
+        curve(row.label, run.time_s, run.error_mrad, COLOURS[indices[row.name] % len(COLOURS)], width=1.0,
+              style=Style.LINE if indices[row.name] < len(COLOURS) else Style.DASHED)
         for row, run in shown
     )  # fmt: skip
     # The first second is not scored; it may leave the picture, so that it does not set the scale.

@@ -136,8 +136,8 @@ def _run(index: int, row: DemoRow, plant: str, duration_s: float, folder: str) -
     session = SteppedSession(demo_config(own, own), world, gains.law.number, gains.pack())
     axis = SteppedAxis(session, own, gains)
     axis.enable()
-    return axis.run(ReferenceMotion.paper(duration_s), lambda passed_s: _tell(index, passed_s / duration_s), 0.5)
+    return axis.run(ReferenceMotion.paper(duration_s), lambda passed_s: _note_share(index, passed_s / duration_s), 0.5)
 
 
-def _tell(index: int, share: float) -> None:
+def _note_share(index: int, share: float) -> None:
     _shares[index] = min(1.0, share)

@@ -110,12 +110,12 @@ _MOST_MISSED = 0.01
 
 def why(faults: Sequence[Mapping[str, Any]], missed_share: float) -> str:
     """The status document's faults with cause and remedy, and what is behind lateness where the bus is not real."""
-    told = " ".join(f"{f['code']}: {f['cause']} {f['remedy']}" for f in faults)
+    text = " ".join(f"{f['code']}: {f['cause']} {f['remedy']}" for f in faults)
     if missed_share <= _MOST_MISSED and _STARVATION.isdisjoint(fault["code"] for fault in faults):
-        return told
+        return text
     missed = f" ({missed_share:.0%} of the cycles were missed)" if missed_share > _MOST_MISSED else ""
     return (
-        f"{told} Likely other programs took the processor{missed}: the demo on the wall clock wants the machine for "
+        f"{text} Likely other programs took the processor{missed}: the demo on the wall clock wants the machine for "
         "itself; `servoctl demo --fast` does not."
     )
 
@@ -124,8 +124,8 @@ def motion_runs(client: ControlClient) -> bool:
     """Whether a motion runs. Raises AnswerIsNo with the faults when the axis is not enabled any more."""
     status: dict[str, Any] = client.call("status")
     if status["axis"]["state"] != "ENABLED":
-        told = why(status["faults"], status["timing"]["missed"] / max(status["timing"]["cycle"], 1))
-        raise AnswerIsNo(f"the axis went to {status['axis']['state']} while it was to move. {told}")
+        reasons = why(status["faults"], status["timing"]["missed"] / max(status["timing"]["cycle"], 1))
+        raise AnswerIsNo(f"the axis went to {status['axis']['state']} while it was to move. {reasons}")
     if abandoned := status["motion"]["abandoned"]:
         raise AnswerIsNo(abandoned)
     return bool(status["axis"]["motion_running"])

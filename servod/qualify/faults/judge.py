@@ -116,11 +116,11 @@ def _refused(words: str | None, refusal: str) -> str:
     return "" if words in refusal else f"the refusal says {refusal or 'nothing'!r}, expected {words!r}"
 
 
-def _says(name: str | None, told: WiringOutcome | None) -> str:
+def _says(name: str | None, outcome: WiringOutcome | None) -> str:
     """The wiring test names what is wrong: each finding has a remedy of its own."""
-    if name is None or (told is not None and told.name == name):
+    if name is None or (outcome is not None and outcome.name == name):
         return ""
-    return f"the wiring test says {told.name if told else 'nothing'}, expected {name}"
+    return f"the wiring test says {outcome.name if outcome else 'nothing'}, expected {name}"
 
 
 def _error_shown(code: int | None, shown: frozenset[int]) -> str:

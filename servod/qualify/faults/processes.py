@@ -54,7 +54,7 @@ _MOVING_NM, _START_S = 0.01, 20.0
 #: The judge continues the motion of before the injection: so many periods it must have seen of it, the first third of
 #: which it leaves out.
 _SHOWN_PERIODS = 1.5
-_TOLD = re.compile(r"fault ([A-Z_]+) \(")
+_LOGGED = re.compile(r"fault ([A-Z_]+) \(")
 _ASKS_TO_END = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 _FAULTED = (DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE)
 
@@ -185,9 +185,9 @@ class ProcessAxis:
             self._expect_exit()
         samples = self.machine.drive_samples()
         axis, shown, overrun = self._shown(samples)
-        told = {FaultCode[name] for name in _TOLD.findall(self.machine.daemon_log())}
+        logged = {FaultCode[name] for name in _LOGGED.findall(self.machine.daemon_log())}
         lost = self._lost_records() + overrun if self._up and self.config.recorder.always else None
-        return Observation(samples, axis, frozenset(shown | told), self.refusal, lost, stated=self._stated)
+        return Observation(samples, axis, frozenset(shown | logged), self.refusal, lost, stated=self._stated)
 
     def recover(self, recovery: Recovery) -> bool:
         """Do what a person would do, and hold for a tenth of a second."""

@@ -390,7 +390,7 @@ def write_page(outcomes: Sequence[Outcome], planned: int, path: Path) -> None:
         page.heading(title)
         failed = not all(outcome.passed for outcome in rows)
         page.table(PageTable(title, HEADER, tuple(map(cells, rows))), folded=not failed)
-        page.folded("What each is, and what the user was told", [_told(outcome) for outcome in rows])
+        page.folded("What each is, and what the user was told", [_remedy_line(outcome) for outcome in rows])
     page.write(path)
 
 
@@ -406,5 +406,5 @@ def _failures(page: Page, outcomes: Sequence[Outcome]) -> None:
         page.points([f"{outcome.name}: {'; '.join(outcome.complaints)}" for outcome in failed])
 
 
-def _told(outcome: Outcome) -> str:
+def _remedy_line(outcome: Outcome) -> str:
     return f"{outcome.name}: {outcome.title}. {outcome.remedy or 'Nothing was to be told.'}"

@@ -281,7 +281,7 @@ def known_joint(scenario: Scenario, config: AxisConfig, folder: Path) -> AxisCon
     joint = joint_of(config.model_copy(update={"model": path}))
     if joint is None:
         return config
-    told = {
+    bounds = {
         "least_inertia": joint.least_inertia,
         "most_inertia": joint.most_inertia,
         "least_friction_nm": joint.friction_nm,
@@ -289,8 +289,8 @@ def known_joint(scenario: Scenario, config: AxisConfig, folder: Path) -> AxisCon
         "load_min_nm": joint.load_min_nm,
         "load_max_nm": joint.load_max_nm,
     }
-    told = {key: joint.torque_factor * value for key, value in told.items()}
-    return config.model_copy(update={"stopping": config.stopping.model_copy(update=told)})
+    bounds = {key: joint.torque_factor * value for key, value in bounds.items()}
+    return config.model_copy(update={"stopping": config.stopping.model_copy(update=bounds)})
 
 
 def merged(base: Nested, over: Nested) -> Nested:

@@ -69,7 +69,7 @@ class _Filling:
         whole = _PLACE.fullmatch(value)
         if whole:
             return self._of(whole[1])
-        return _PLACE.sub(lambda place: str(self._of(place[1])), value)
+        return _PLACE.sub(lambda match: str(self._of(match[1])), value)
 
     def check_all_read(self) -> None:
         """Raises BadInput for a key of the row that nothing reads."""

@@ -8,7 +8,7 @@ sweeps.py       what only the compiled simulator is fast enough for
 equations.py    printed against consistent equations: friction
 programme.py    printed against consistent equations: (12) to (15)
 results.py      everything that a run found
-friction.py, loops.py, motions.py, beyond.py  the figures and their claims
+friction.py, loops.py, motions.py, open_questions.py  the figures and their claims
 table.py        the paper's numbers beside ours
 document.py     files: JSON, Markdown, page, pictures
 walk.py         all of it in order, on several processes, with progress and a clean end at Ctrl-C

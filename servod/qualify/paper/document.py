@@ -17,7 +17,7 @@ from servod.common.files import write_bytes
 from servod.formats.gains.parameters import LocalParameters
 from servod.lab.report.figure import PageTable
 from servod.lab.report.page import Page, Verdict
-from servod.qualify.paper import beyond, friction, loops, motions, table
+from servod.qualify.paper import friction, loops, motions, open_questions, table
 from servod.qualify.paper.claims import Claim, Shown
 from servod.qualify.paper.experiments import Found, Measured
 from servod.qualify.paper.joints import PaperJoint
@@ -35,7 +35,7 @@ _NOTE = (
 
 def shown(results: Results) -> list[Shown]:
     """All figures with their claims, in the paper's order."""
-    parts: Iterator[Shown] = (s for part in (friction, loops, motions, beyond) for s in part.figures(results))
+    parts: Iterator[Shown] = (s for part in (friction, loops, motions, open_questions) for s in part.figures(results))
     return sorted(parts, key=lambda s: int(s.number.split(",")[0]) if s.number[0].isdigit() else 99)
 
 
@@ -51,7 +51,7 @@ def document(results: Results, figures: Sequence[Shown], elapsed_s: float) -> di
         "noise_on_friction": results.noise,
         "figures": [s.document() for s in figures],
         "programme": [asdict(answer) for answer in results.programme],
-        "statements": [{"about": about, **asdict(claim)} for about, claim in beyond.statements(results)],
+        "statements": [{"about": about, **asdict(claim)} for about, claim in open_questions.statements(results)],
     }
 
 

@@ -1,6 +1,6 @@
 """Printed against consistent equations: (18) with its sign, (8) taken literally, (15) as it stands.
 
-Jobs of the crew; each gives figures that say what the slip does, none is used elsewhere.
+Jobs of the pool; each gives figures that say what the slip does, none is used elsewhere.
 """
 
 from __future__ import annotations

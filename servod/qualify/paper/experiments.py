@@ -1,6 +1,6 @@
 """What is done on a virtual axis over the whole CAN loop, SYNC-stepped: identify, design, track and step.
 
-Jobs of the crew: plain values in and out. An axis that refuses or faults is a result, not an error: the paper's own
+Jobs of the pool: plain values in and out. An axis that refuses or faults is a result, not an error: the paper's own
 numbers may trip it.
 """
 
@@ -73,7 +73,7 @@ def identify_and_design(joint: PaperJoint, seed: int) -> Found:
     return Found(model, design(model), analysis.presliding)
 
 
-def design_as_told(joint: PaperJoint) -> Found:
+def design_for_model(joint: PaperJoint) -> Found:
     """`joint` designed for by its own model, without an identification: what a quick look takes. Raises AnswerIsNo."""
     model = joint.model()
     return Found(model, design(model), None)

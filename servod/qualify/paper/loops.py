@@ -40,7 +40,7 @@ def _nearer(gains: GainSet, velocities: Sequence[float], what: str) -> Claim:
     """Mean distance in dB of position over torque from the rigid joint's, before and after."""
     design, law = design_of(gains), local_law(gains)
     with_observer = law.disturbance_observer is not None
-    told, better = [], []
+    clauses, better = [], []
     for v in velocities:
         alone = _distance_db(design, before(design, v))
         plain, whole = closed_loop_response(design, law, v, False), closed_loop_response(design, law, v, with_observer)
@@ -52,10 +52,10 @@ def _nearer(gains: GainSet, velocities: Sequence[float], what: str) -> Claim:
             for name, loop in (("(9)", plain), ("the observer", whole))
             if spectral_radius(loop[0][None])[0] > 1 + 1e-6
         ]
-        told.append(text + (f" (without feedback unstable with {' and '.join(unstable)})" if unstable else ""))
+        clauses.append(text + (f" (without feedback unstable with {' and '.join(unstable)})" if unstable else ""))
         better.append(_distance_db(design, plain) < alone)
     paper = f"compensation improves the local dynamics at {what} velocities"
-    return Claim(paper, "the distance from a rigid joint, 1 to 100 Hz, is " + "; ".join(told), all(better))
+    return Claim(paper, "the distance from a rigid joint, 1 to 100 Hz, is " + "; ".join(clauses), all(better))
 
 
 def _distance_db(design: Design, loop: Loop) -> float:

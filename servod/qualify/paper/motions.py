@@ -79,8 +79,8 @@ def _robust(results: Results) -> Claim:
     """The proposed law against its own error without noise."""
     own = results.noise[Row.TABLE1.label]
     shares = ", ".join(f"{share:.0%}" for share in NOISE_SHARES)
-    told = ", ".join(f"{rms:.4g}" for rms in own)
-    here = f"{told} mrad RMS on (19) with noise of 0, {shares} of F_C"
+    errors_mrad = ", ".join(f"{rms:.4g}" for rms in own)
+    here = f"{errors_mrad} mrad RMS on (19) with noise of 0, {shares} of F_C"
     return Claim("the proposed law stands friction that leaves its nominal level", here, own[-1] < NET * own[0])
 
 
@@ -138,7 +138,7 @@ def _response(results: Results, joint: PaperJoint, row: Row, size: float) -> Ste
     return results.measured[joint, row].responses.get(size)
 
 
-def _told(results: Results, joint: PaperJoint, row: Row, size: float) -> str:
+def _step_text(results: Results, joint: PaperJoint, row: Row, size: float) -> str:
     """One step in words."""
     found = _response(results, joint, row, size)
     if found is None:
@@ -161,7 +161,7 @@ def _torque_swing(motion: PlottedMotion) -> float:
 def _faster(results: Results, joint: PaperJoint, size: float, better: Row, worse: Row, paper: str) -> Claim:
     """Whether `better` settles sooner than `worse`, and settles at all."""
     one, other = (_response(results, joint, row, size) for row in (better, worse))
-    here = "; ".join(_told(results, joint, row, size) for row in (better, worse))
+    here = "; ".join(_step_text(results, joint, row, size) for row in (better, worse))
     if one is None or one.settling_s is None:
         return Claim(paper, here, False)
     return Claim(paper, here, other is None or other.settling_s is None or one.settling_s < other.settling_s)
@@ -173,7 +173,7 @@ def _step_claims(results: Results, joint: PaperJoint, size: float) -> tuple[Clai
     if size == STEPS_MRAD[0]:
         pd = _response(results, joint, Row.PD, size)
         left = pd is not None and pd.steady_error_mrad > STEADY_SHARE * size
-        steady = Claim("PD alone leaves a steady-state error", _told(results, joint, Row.PD, size), left)
+        steady = Claim("PD alone leaves a steady-state error", _step_text(results, joint, Row.PD, size), left)
         said = "the proposed law is slightly faster than PD + LuGre"
         return steady, _faster(results, joint, size, Row.TABLE1, Row.LUGRE_OSCILLATES, said), mine
     still = _faster(results, joint, size, Row.TABLE1, Row.LUGRE_BETTER, "the proposed law does better still")
@@ -184,10 +184,10 @@ def _oscillation(results: Results, joint: PaperJoint, size: float) -> tuple[Clai
     """Both l_f, by how far the torque swings once the step is over."""
     steps = results.measured[joint, Row.LUGRE_OSCILLATES].steps, results.measured[joint, Row.LUGRE_BETTER].steps
     high, low = (_torque_swing(found[size]) if size in found else math.inf for found in steps)
-    first = _told(results, joint, Row.LUGRE_OSCILLATES, size)
+    first = _step_text(results, joint, Row.LUGRE_OSCILLATES, size)
     return (
         Claim("l_f = 0.35 oscillates at 10 mrad", first, high > OSCILLATES_NM),
-        Claim("l_f = 0.25 does better", f"{first}; {_told(results, joint, Row.LUGRE_BETTER, size)}", low < high),
+        Claim("l_f = 0.25 does better", f"{first}; {_step_text(results, joint, Row.LUGRE_BETTER, size)}", low < high),
     )
 
 

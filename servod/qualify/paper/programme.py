@@ -1,6 +1,6 @@
 """The paper's programme (12)-(15), printed and consistent, and what its answer does on the sampled axis.
 
-A job of the crew; stands on the reference mode of synthesis. The programme knows no sample time: whether its feedback
+A job of the pool; stands on the reference mode of synthesis. The programme knows no sample time: whether its feedback
 stands one is judged by the full sampled loop and by a simulated run.
 """
 

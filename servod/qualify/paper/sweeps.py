@@ -1,6 +1,6 @@
 """What only the compiled simulator is fast enough for: sweeps of l, readings of the gains, friction with noise on it.
 
-Jobs of the crew, all on Table I's joint. What the simulator leaves out: the drive's steps of torque and its rate limit.
+Jobs of the pool, all on Table I's joint. What the simulator leaves out: the drive's steps of torque and its rate limit.
 """
 
 from __future__ import annotations

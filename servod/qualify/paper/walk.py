@@ -1,6 +1,6 @@
 """The whole of `servoctl qualify paper`: identify, design, track, sweep, draw, in as little time as the cores allow.
 
-Above everything of `paper`; its jobs go to the crew, what they found is gathered here.
+Above everything of `paper`; its jobs go to the pool, what they found is gathered here.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from servod.lab.report.figure import Figure
 from servod.lab.report.figures.sets import local_law
 from servod.lab.report.pictures import write_pictures
 from servod.lab.tune.plan import Feedback
-from servod.qualify.paper import beyond, document, equations, experiments, motions, programme, sweeps
+from servod.qualify.paper import document, equations, experiments, motions, open_questions, programme, sweeps
 from servod.qualify.paper.experiments import Contender, Found, Measured, cutoff_of
 from servod.qualify.paper.joints import PaperJoint, at_paper_feedback, printed_l, shipped_set, with_l, without_observer
 from servod.qualify.paper.printed import FRICTION
@@ -36,22 +36,22 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 #: Told what was finished last, and the share of all work that is done.
-Tell = Callable[[str, float], None]
+OnProgress = Callable[[str, float], None]
 
 MOST_WORKERS = 4
 _POLL_S = 0.05
 
 
-class Crew:
+class JobPool:
     """Worker processes, one for each core and at least two; leaving the block ends them at once."""
 
-    def __init__(self, tell: Tell, expected_s: float) -> None:
+    def __init__(self, on_progress: OnProgress, expected_s: float) -> None:
         """`expected_s`: sum of the weights of all jobs that will come, in seconds of one core."""
-        self._tell, self._expected_s, self._done_s = tell, expected_s, 0.0
+        self._on_progress, self._expected_s, self._done_s = on_progress, expected_s, 0.0
         self._stack = ExitStack()
         self._open: dict[Future[Any], tuple[str, float]] = {}
 
-    def __enter__(self) -> Crew:
+    def __enter__(self) -> JobPool:
         workers = min(MOST_WORKERS, max(2, usable_cores()))
         self._pool = self._stack.enter_context(worker_pool(workers))
         return self
@@ -81,7 +81,7 @@ class Crew:
         what, weight_s = self._open.pop(ended)
         ended.result()  # a failure of any job ends the walk, not only of the one that is waited for
         self._done_s += weight_s
-        self._tell(what, min(1.0, self._done_s / self._expected_s))
+        self._on_progress(what, min(1.0, self._done_s / self._expected_s))
 
 
 #: l_i of the local law at the paper's PD gains without observer, in all its sets; as the demo's plain set.
@@ -128,16 +128,16 @@ QUICK = PaperPlan(
 )
 
 
-def paper(plan: PaperPlan, out: Path, tell: Tell) -> dict[str, Any]:
+def paper(plan: PaperPlan, out: Path, on_progress: OnProgress) -> dict[str, Any]:
     """Do the paper into the folder `out` and return its document. Raises BadInput and AnswerIsNo."""
     started = time.monotonic()
-    with Crew(tell, expected_s(plan)) as crew:
-        results = gather(plan, crew)
+    with JobPool(on_progress, expected_s(plan)) as pool:
+        results = gather(plan, pool)
         figures = document.shown(results)
         if plan.pictures:
-            drawn = [crew.submit(f"{s.figure.name}", 1.5, draw, s.figure, out / document.PICTURES) for s in figures]
+            drawn = [pool.submit(f"{s.figure.name}", 1.5, draw, s.figure, out / document.PICTURES) for s in figures]
             for picture in drawn:
-                crew.result(picture)
+                pool.result(picture)
     found = document.document(results, figures, time.monotonic() - started)
     document.write(out, figures, found)
     return found
@@ -156,55 +156,55 @@ def _track_s(plan: PaperPlan) -> float:
 
 
 def draw(figure: Figure, folder: Path) -> None:
-    """One figure as pictures: a job of the crew."""
+    """One figure as pictures: a job of the pool."""
     write_pictures(figure, folder)
 
 
-def gather(plan: PaperPlan, crew: Crew) -> Results:
+def gather(plan: PaperPlan, pool: JobPool) -> Results:
     """Everything that is run; what needs an identification waits for it, all else goes on meanwhile."""
-    found = {joint: _found(plan, crew, joint) for joint in plan.joints}
-    tracked = {key: job for joint in plan.joints for key, job in _track_shipped(plan, crew, joint)}
-    swept = _sweep(plan, crew)
-    noise = crew.submit(
+    found = {joint: _found(plan, pool, joint) for joint in plan.joints}
+    tracked = {key: job for joint in plan.joints for key, job in _track_shipped(plan, pool, joint)}
+    swept = _sweep(plan, pool)
+    noise = pool.submit(
         "noise on friction", 3.0, sweeps.under_noise, _noise_sets(), FRICTION.coulomb, plan.seconds, plan.seed
     )
     slips = {
-        beyond.EXPONENT: crew.submit("(18)", 1.0, equations.exponent_of_18, plan.seconds),
-        beyond.LITERAL_8: crew.submit("(8)", 1.0, equations.literal_8, plan.seconds),
+        open_questions.EXPONENT: pool.submit("(18)", 1.0, equations.exponent_of_18, plan.seconds),
+        open_questions.LITERAL_8: pool.submit("(8)", 1.0, equations.literal_8, plan.seconds),
     }
-    solved = crew.submit("(12) to (15)", 3.0, programme.answers, plan.seconds)
-    sines = _sines(plan, crew)
-    designed = {joint: crew.result(job) for joint, job in found.items()}
-    tracked |= {key: job for joint, it in designed.items() for key, job in _track_found(plan, crew, joint, it)}
+    solved = pool.submit("(12) to (15)", 3.0, programme.answers, plan.seconds)
+    sines = _sines(plan, pool)
+    designed = {joint: pool.result(job) for joint, job in found.items()}
+    tracked |= {key: job for joint, it in designed.items() for key, job in _track_found(plan, pool, joint, it)}
     return Results(
         plan.seed,
         plan.seconds,
         designed,
-        {key: crew.result(job) for key, job in tracked.items()},
-        {name: crew.result(job) for name, job in sines.items()},
-        {name: crew.result(job) for name, job in swept.items()},
-        crew.result(noise),
-        {name: crew.result(job) for name, job in slips.items()},
-        crew.result(solved),
-        {joint: _contenders(plan, crew, joint, designed[joint]) for joint in plan.tune if joint in designed},
+        {key: pool.result(job) for key, job in tracked.items()},
+        {name: pool.result(job) for name, job in sines.items()},
+        {name: pool.result(job) for name, job in swept.items()},
+        pool.result(noise),
+        {name: pool.result(job) for name, job in slips.items()},
+        pool.result(solved),
+        {joint: _contenders(plan, pool, joint, designed[joint]) for joint in plan.tune if joint in designed},
     )
 
 
-def _found(plan: PaperPlan, crew: Crew, joint: PaperJoint) -> Future[Found]:
+def _found(plan: PaperPlan, pool: JobPool, joint: PaperJoint) -> Future[Found]:
     if plan.identify:
-        return crew.submit(f"{joint.label} identified", 45.0, experiments.identify_and_design, joint, plan.seed)
-    return crew.submit(f"{joint.label} designed for", 6.0, experiments.design_as_told, joint)
+        return pool.submit(f"{joint.label} identified", 45.0, experiments.identify_and_design, joint, plan.seed)
+    return pool.submit(f"{joint.label} designed for", 6.0, experiments.design_for_model, joint)
 
 
-def _contenders(plan: PaperPlan, crew: Crew, joint: PaperJoint, found: Found) -> list[Contender]:
+def _contenders(plan: PaperPlan, pool: JobPool, joint: PaperJoint, found: Found) -> list[Contender]:
     """Every rival tuned on what was found of the joint, each scored as soon as its law is done."""
     cutoff_hz = cutoff_of(found.gains)
     tuned = [
-        crew.submit(f"{names[0]} tuned", _TUNE_S, experiments.tuned_sets, found.model, names, cutoff_hz, plan.seed)
+        pool.submit(f"{names[0]} tuned", _TUNE_S, experiments.tuned_sets, found.model, names, cutoff_hz, plan.seed)
         for names in experiments.FAMILIES
     ]
     scored = {
-        (feedback, name): crew.submit(
+        (feedback, name): pool.submit(
             f"{name} scored",
             _SCORE_S,
             experiments.score_rival,
@@ -217,17 +217,17 @@ def _contenders(plan: PaperPlan, crew: Crew, joint: PaperJoint, found: Found) ->
             plan.seconds,
         )
         for job in tuned
-        for (feedback, name), gains in crew.result(job).items()
+        for (feedback, name), gains in pool.result(job).items()
     }
-    return [crew.result(scored[feedback, name]) for feedback in Feedback for name in experiments.LABELS]
+    return [pool.result(scored[feedback, name]) for feedback in Feedback for name in experiments.LABELS]
 
 
 Tracked = tuple[tuple[PaperJoint, Row], Future[Measured]]
 
 
-def _track_shipped(plan: PaperPlan, crew: Crew, joint: PaperJoint) -> Iterator[Tracked]:
+def _track_shipped(plan: PaperPlan, pool: JobPool, joint: PaperJoint) -> Iterator[Tracked]:
     """The paper's sets in all readings."""
-    yield from _track(plan, crew, joint, paper_sets())
+    yield from _track(plan, pool, joint, paper_sets())
 
 
 def paper_sets() -> dict[Row, GainSet]:
@@ -236,9 +236,9 @@ def paper_sets() -> dict[Row, GainSet]:
     return sets | {Row.TABLE1_PRINTED_L: printed_l(sets[Row.TABLE1])}
 
 
-def _track_found(plan: PaperPlan, crew: Crew, joint: PaperJoint, found: Found) -> Iterator[Tracked]:
+def _track_found(plan: PaperPlan, pool: JobPool, joint: PaperJoint, found: Found) -> Iterator[Tracked]:
     """The identified joint's sets."""
-    yield from _track(plan, crew, joint, designed_sets(found.gains), cutoff_of(found.gains))
+    yield from _track(plan, pool, joint, designed_sets(found.gains), cutoff_of(found.gains))
 
 
 def designed_sets(gains: GainSet) -> dict[Row, GainSet]:
@@ -250,19 +250,19 @@ def designed_sets(gains: GainSet) -> dict[Row, GainSet]:
 
 
 def _track(
-    plan: PaperPlan, crew: Crew, joint: PaperJoint, sets: dict[Row, GainSet], cutoff_hz: float | None = None
+    plan: PaperPlan, pool: JobPool, joint: PaperJoint, sets: dict[Row, GainSet], cutoff_hz: float | None = None
 ) -> Iterator[Tracked]:
     for row, gains in sets.items():
         what = f"{row.label} on {joint.label}"
         settings = (cutoff_hz or cutoff_of(gains), plan.seed, plan.seconds, plan.hold_s)
-        yield (joint, row), crew.submit(what, _track_s(plan), experiments.measure, joint, row.label, gains, *settings)
+        yield (joint, row), pool.submit(what, _track_s(plan), experiments.measure, joint, row.label, gains, *settings)
 
 
-def _sweep(plan: PaperPlan, crew: Crew) -> dict[str, Future[sweeps.SweepOfL]]:
+def _sweep(plan: PaperPlan, pool: JobPool) -> dict[str, Future[sweeps.SweepOfL]]:
     table1 = shipped_set("table1_kz_kv_kx")
-    bases = {beyond.TABLE1_GAINS: table1, beyond.PD_GAINS: at_paper_feedback(table1, "pd_gains")}
+    bases = {open_questions.TABLE1_GAINS: table1, open_questions.PD_GAINS: at_paper_feedback(table1, "pd_gains")}
     return {
-        name: crew.submit(f"l with {name}", 3.0, sweeps.sweep_of_l, gains, plan.seconds, plan.factors)
+        name: pool.submit(f"l with {name}", 3.0, sweeps.sweep_of_l, gains, plan.seconds, plan.factors)
         for name, gains in bases.items()
     }
 
@@ -271,13 +271,13 @@ def _noise_sets() -> dict[str, GainSet]:
     return {row.label: shipped_set(_SHIPPED[row]) for row in (Row.DOB, Row.LUGRE, Row.LUGRE_BETTER, Row.TABLE1)}
 
 
-def _sines(plan: PaperPlan, crew: Crew) -> dict[str, Future[Any]]:
+def _sines(plan: PaperPlan, pool: JobPool) -> dict[str, Future[Any]]:
     """Fig. 9 to 12."""
     table1, pd = shipped_set("table1_kz_kv_kx"), shipped_set("paper_pd")
     noise_nm = NOISE_SHARE * FRICTION.coulomb
     disturbed = motions.DISTURBED
     return {
-        motions.PROPOSED: crew.submit("Fig. 9", 0.5, sweeps.on_sine, motions.PROPOSED, table1, plan.seconds),
-        motions.PD: crew.submit("Fig. 10", 0.5, sweeps.on_sine, motions.PD, pd, plan.seconds),
-        disturbed: crew.submit("Fig. 11", 0.5, sweeps.on_sine, disturbed, table1, plan.seconds, noise_nm, plan.seed),
+        motions.PROPOSED: pool.submit("Fig. 9", 0.5, sweeps.on_sine, motions.PROPOSED, table1, plan.seconds),
+        motions.PD: pool.submit("Fig. 10", 0.5, sweeps.on_sine, motions.PD, pd, plan.seconds),
+        disturbed: pool.submit("Fig. 11", 0.5, sweeps.on_sine, disturbed, table1, plan.seconds, noise_nm, plan.seed),
     }

@@ -65,7 +65,7 @@ def document(axis: SoakedAxis, memories: Mapping[str, Memory], wall_s: float, co
         "faults_spoilt_proof": sum(f.spoilt for f in faults),
         "faults_recovered": sum(f.recovered for f in faults),
         "wrong": {str(kind): count for kind, count in findings.counts.items()},
-        "findings": [{**f._asdict(), "wrong": str(f.wrong)} for f in findings.told],
+        "findings": [{**f._asdict(), "wrong": str(f.wrong)} for f in findings.anomalies],
         "faults": {name: fault.document() for name, fault in sorted(tally.faults.items())},
         "moves": dict(tally.moves),
         "endings": dict(tally.endings),
@@ -129,12 +129,12 @@ def _added_fault(faults: Sequence[dict[str, Any]]) -> dict[str, Any]:
     total: dict[str, Any] = {name: sum(f[name] for f in faults) for name in COUNTED}
     total["latched"] = dict(sum((Counter(f["latched"]) for f in faults), Counter()))
     for name in ("detected", "left_command", "torque_gone"):
-        bins = sum((Counter({int(place): n for place, n in f[name]["bins_ms"].items()}) for f in faults), Counter())
+        bins = sum((Counter({int(bin_ms): n for bin_ms, n in f[name]["bins_ms"].items()}) for f in faults), Counter())
         total[name] = {
             "count": bins.total(),
             "median_ms": median_ms(bins),
             "largest_ms": max(f[name]["largest_ms"] for f in faults),
-            "bins_ms": {str(place): bins[place] for place in sorted(bins)},
+            "bins_ms": {str(bin_ms): bins[bin_ms] for bin_ms in sorted(bins)},
         }
     return total
 
@@ -251,7 +251,7 @@ def _reactions(found: dict[str, Any]) -> Figure:
     """From the injection to the last torque, each kind in a panel of its own."""
     panels = []
     for name, fault in found["faults"].items():
-        bins = {int(place): count for place, count in fault["torque_gone"]["bins_ms"].items()}
+        bins = {int(bin_ms): count for bin_ms, count in fault["torque_gone"]["bins_ms"].items()}
         if not bins or not fault["detected"]["count"]:
             continue
         x, counts = np.array(sorted(bins), dtype=float), np.array([bins[p] for p in sorted(bins)], dtype=float)

@@ -87,10 +87,10 @@ def check_reaction(
     tally: FaultTally,
     findings: Findings,
     grace_ms: float = 0.0,
-    starved_ms: float = 0.0,
+    waited_ms: float = 0.0,
 ) -> bool:
     """Count both times, and find what was too late. `grace_ms`: what belongs to each bound besides that of the kind;
-    `starved_ms`: how long the processes had to wait for their turn.
+    `waited_ms`: how long the processes had to wait for their turn.
 
     Returns whether a time was late, but no later than that wait excuses.
     """
@@ -101,9 +101,9 @@ def check_reaction(
     ):
         if time_ms is not None:
             seen.add(time_ms)
-        if time_ms is None or time_ms > limit_ms + starved_ms:
-            told = "never" if time_ms is None else f"after {time_ms:.0f} ms"
-            findings.add(Wrong.LATE, injected_ns, f"{kind.name}: {what} {told}, {limit_ms:g} ms allowed")
+        if time_ms is None or time_ms > limit_ms + waited_ms:
+            when = "never" if time_ms is None else f"after {time_ms:.0f} ms"
+            findings.add(Wrong.LATE, injected_ns, f"{kind.name}: {what} {when}, {limit_ms:g} ms allowed")
         elif time_ms > limit_ms:
             excused = True
     return excused

@@ -30,7 +30,7 @@ from servod.qualify.soak.wall_clock import WallSoak, of_the_wall
 
 
 #: Told one line on how it goes, and the share that is done.
-Tell = Callable[[str, float], None]
+OnProgress = Callable[[str, float], None]
 DOCUMENT_NAME = "soak.json"
 _SAVE_S = 10.0
 #: Between two looks at memory [s of axis time]; a look hands back what is not used, which takes a tenth of a second.
@@ -67,7 +67,7 @@ class SoakWatch:
 
 
 def run(
-    axis: SoakedAxis, episodes: Iterable[Episode], cycles: int, limit_s: float, folder: Path, tell: Tell
+    axis: SoakedAxis, episodes: Iterable[Episode], cycles: int, limit_s: float, folder: Path, on_progress: OnProgress
 ) -> dict[str, Any]:
     """Soak for `cycles`, at the longest `limit_s`, or through all `episodes`; Ctrl-C ends it early, which is no pass.
 
@@ -75,7 +75,7 @@ def run(
     """
     watch, course = SoakWatch(limit_s), Course.CUT_SHORT
     try:
-        _go_through(axis, episodes, cycles, watch, folder, tell)
+        _go_through(axis, episodes, cycles, watch, folder, on_progress)
         course = Course.COMPLETE
     except KeyboardInterrupt:
         course = Course.INTERRUPTED
@@ -97,7 +97,7 @@ def save(found: dict[str, Any], folder: Path) -> None:
 
 
 def _go_through(
-    axis: SoakedAxis, episodes: Iterable[Episode], cycles: int, watch: SoakWatch, folder: Path, tell: Tell
+    axis: SoakedAxis, episodes: Iterable[Episode], cycles: int, watch: SoakWatch, folder: Path, on_progress: OnProgress
 ) -> None:
     next_save_s = 0.0
     watch.look(axis.processes(), axis.counts.axis_s)
@@ -105,7 +105,7 @@ def _go_through(
         axis.episode(episode)
         watch.look(axis.processes(), axis.counts.axis_s)
         done, elapsed_s = axis.counts.cycles, watch.elapsed_s
-        tell(_line(axis, elapsed_s), max(done / cycles, elapsed_s / watch.limit_s))
+        on_progress(_line(axis, elapsed_s), max(done / cycles, elapsed_s / watch.limit_s))
         if elapsed_s > next_save_s:
             save(document(axis, watch.longest, elapsed_s, Course.RUNNING), folder)
             next_save_s = elapsed_s + _SAVE_S
@@ -144,40 +144,40 @@ class Order(NamedTuple):
     out: Path
 
 
-def launch(order: Order, jobs: int, tell: Tell) -> dict[str, Any]:
+def launch(order: Order, jobs: int, on_progress: OnProgress) -> dict[str, Any]:
     """Soak, and write document and page to `order.out`."""
     with sigterm_as_interrupt():
-        found = _single(order, tell) if jobs == 1 else _several(order, jobs, tell)
+        found = _single(order, on_progress) if jobs == 1 else _several(order, jobs, on_progress)
         found |= {"mode": "wall" if order.wall else "stepped", "seeds": list(range(order.seed, order.seed + jobs))}
     save(found, order.out)
     write_page(found, order.out)
     return found
 
 
-def _single(order: Order, tell: Tell) -> dict[str, Any]:
+def _single(order: Order, on_progress: OnProgress) -> dict[str, Any]:
     limit_s = math.inf if order.limit_hours is None else order.limit_hours * 3600.0
     if order.wall:
-        return _wall(order, limit_s, tell)
+        return _wall(order, limit_s, on_progress)
     with closing(SteppedSoak(order.seed, order.out)) as axis:
-        return run(axis, schedule(order.seed, GAIN_SETS), order.cycles, limit_s, order.out, tell)
+        return run(axis, schedule(order.seed, GAIN_SETS), order.cycles, limit_s, order.out, on_progress)
 
 
-def _wall(order: Order, limit_s: float, tell: Tell) -> dict[str, Any]:
+def _wall(order: Order, limit_s: float, on_progress: OnProgress) -> dict[str, Any]:
     """Cycles take their time on the wall clock; sockets want a short path."""
     kinds = tuple(filter(of_the_wall, KINDS))
     limit_s = min(limit_s, order.cycles / _CYCLES_PER_S)
     with socket_folder("servod-soak-") as folder, closing(WallSoak(order.seed, Path(folder))) as axis:
-        return run(axis, schedule(order.seed, GAIN_SETS, kinds), sys.maxsize, limit_s, order.out, tell)
+        return run(axis, schedule(order.seed, GAIN_SETS, kinds), sys.maxsize, limit_s, order.out, on_progress)
 
 
-def _several(order: Order, jobs: int, tell: Tell) -> dict[str, Any]:
+def _several(order: Order, jobs: int, on_progress: OnProgress) -> dict[str, Any]:
     """The same command in processes of their own, with seeds of their own; Ctrl-C is passed on."""
     folders = [order.out / str(order.seed + job) for job in range(jobs)]
     processes = [_start(order._replace(seed=order.seed + job, out=folder)) for job, folder in enumerate(folders)]
     try:
         while any(process.poll() is None for process in processes):
             time.sleep(_POLL_S)
-            _tell(folders, order.cycles, tell)
+            _report_progress(folders, order.cycles, on_progress)
     except KeyboardInterrupt:
         for process in processes:
             process.send_signal(signal.SIGTERM)
@@ -217,11 +217,11 @@ def _start(order: Order) -> subprocess.Popen[bytes]:
     )
 
 
-def _tell(folders: Sequence[Path], cycles: int, tell: Tell) -> None:
+def _report_progress(folders: Sequence[Path], cycles: int, on_progress: OnProgress) -> None:
     with suppress(Unreachable):
         found = added([_read(folder) for folder in folders])
         share = found["cycles"] / cycles / len(folders)
-        tell(f"{found['cycles'] / 1e6:.2f} M cycles, {sum(found['wrong'].values())} wrong", share)
+        on_progress(f"{found['cycles'] / 1e6:.2f} M cycles, {sum(found['wrong'].values())} wrong", share)
 
 
 def _read(folder: Path) -> dict[str, Any]:

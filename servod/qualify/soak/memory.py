@@ -94,10 +94,10 @@ class Memory:
         """Growth over the second half."""
         curve = self.curve
         edges = np.linspace(0.5, 1.0, _BLOCKS + 1) * (curve[-1, 0] if len(curve) else 0.0)
-        places = np.searchsorted(curve[:, 0], edges)
-        if np.diff(places).min() < 1:
+        bounds = np.searchsorted(curve[:, 0], edges)
+        if np.diff(bounds).min() < 1:
             return Slope(0.0, -math.inf, math.inf, Growth.TOO_SHORT)
-        blocks = [curve[begin:end] for begin, end in itertools.pairwise(places)]
+        blocks = [curve[begin:end] for begin, end in itertools.pairwise(bounds)]
         points = np.array([(block[:, 0].mean(), block[:, 1].min()) for block in blocks])
         hours, resident_kb = points[:, 0] / 3600.0, points[:, 1]
         (slope, level), spread = np.polyfit(hours, resident_kb, 1), hours - hours.mean()

@@ -119,8 +119,8 @@ class RowCheck:
     def _values(self, rows: Rows) -> None:
         """Finite numbers, but for the controller's own while NOT_FINITE is latched; torque only under control."""
         bad, own = (functools.reduce(np.logical_or, [~np.isfinite(rows[n]) for n in names]) for names in (_REAL, _OWN))
-        told = (rows["faults"] | rows["faults_latched"]) & _NOT_FINITE != 0
-        self._first(Wrong.NOT_FINITE, rows, bad | (own & ~told), "a number that is not finite")
+        reported = (rows["faults"] | rows["faults_latched"]) & _NOT_FINITE != 0
+        self._first(Wrong.NOT_FINITE, rows, bad | (own & ~reported), "a number that is not finite")
         torque_nm = rows["torque_nm"]
         self._first(Wrong.LIMIT, rows, np.abs(torque_nm) > self._limit_nm, "torque above limits.torque_nm")
         uncontrolled = ~np.isin(rows["axis_state"], _POWERED)
@@ -157,9 +157,9 @@ class RowCheck:
 
 def run_lengths(flags: NDArray[np.bool_], before: int) -> NDArray[np.int64]:
     """At each place, how many true flags in a row end there; `before` of them came earlier."""
-    places = np.arange(1, len(flags) + 1)
-    last_false = np.maximum.accumulate(np.where(flags, -before, places))
-    return np.where(flags, places - last_false, 0)
+    positions = np.arange(1, len(flags) + 1)
+    last_false = np.maximum.accumulate(np.where(flags, -before, positions))
+    return np.where(flags, positions - last_false, 0)
 
 
 # --- Recorded files --------------------------------------------------------------------------------------------------
@@ -184,7 +184,7 @@ class RecordedRows:
         self._rows_of_session = self._latched = 0
         self.excused: Counter[str] = Counter()
 
-    def take(self, schedule: ExcusedFaults, starved: ExcusedFaults, ended: bool) -> None:
+    def take(self, schedule: ExcusedFaults, starvation: ExcusedFaults, ended: bool) -> None:
         """Check every complete file; with `ended` the daemon is gone and all are.
 
         A fault has its cause in the schedule, or in a machine that starved the processes at that time; the second are
@@ -197,17 +197,17 @@ class RecordedRows:
             if recording.truncated:
                 self._findings.add(Wrong.RECORDER, None, f"{path.name} has no end")
             rows = rows_of(recording.rows)
-            self.check.check(rows, self._allowed(rows, schedule, starved), _ANSWER_CYCLES)
+            self.check.check(rows, self._allowed(rows, schedule, starvation), _ANSWER_CYCLES)
             self._rows_of_session += len(recording)
             self.files += 1
             path.unlink()
 
-    def _allowed(self, rows: Rows, schedule: ExcusedFaults, starved: ExcusedFaults) -> NDArray[np.int64]:
+    def _allowed(self, rows: Rows, schedule: ExcusedFaults, starvation: ExcusedFaults) -> NDArray[np.int64]:
         """The fault bits that each row may have; counts those that only a starved machine explains."""
         latched = rows["faults_latched"]
         before = np.concatenate(([self._latched], latched[:-1]))[: len(latched)]
         strict = schedule.at(rows["time_ns"])
-        allowed = strict | starved.at(rows["time_ns"])
+        allowed = strict | starvation.at(rows["time_ns"])
         for bits in (latched & ~before & allowed & ~strict).tolist():
             self.excused.update(fault.code.name for fault in faults_in(bits))
         self._latched = int(latched[-1]) if len(latched) else self._latched

@@ -54,17 +54,17 @@ class SyncCheck:
         times_ns, heard = rows["time_ns"], np.array(heard_ns, dtype=np.int64)
         # A row before all others takes what belongs to none of them.
         starts = np.concatenate(([-self._period_ns], times_ns))
-        place = np.searchsorted(starts, heard, side="right") - 1
-        alone = heard - starts[place] >= self._period_ns
-        self._tell(heard, alone, "SYNC on the bus without a row")
-        counts = np.bincount(place[~alone], minlength=len(starts))[1:]
-        self._tell(times_ns, counts > 1, "row with more than one SYNC")
+        row = np.searchsorted(starts, heard, side="right") - 1
+        alone = heard - starts[row] >= self._period_ns
+        self._report(heard, alone, "SYNC on the bus without a row")
+        counts = np.bincount(row[~alone], minlength=len(starts))[1:]
+        self._report(times_ns, counts > 1, "row with more than one SYNC")
         if may_be_taken:
             self.taken += int((counts == 0).sum())
         else:
-            self._tell(times_ns, counts == 0, "row without SYNC on the bus")
+            self._report(times_ns, counts == 0, "row without SYNC on the bus")
 
-    def _tell(self, times_ns: NDArray[np.int64], where: NDArray[np.bool_], text: str) -> None:
+    def _report(self, times_ns: NDArray[np.int64], where: NDArray[np.bool_], text: str) -> None:
         if where.any():
             self._findings.add(Wrong.SYNC, int(times_ns[int(np.argmax(where))]), text, int(where.sum()))
 

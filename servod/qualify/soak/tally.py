@@ -34,22 +34,22 @@ class Times:
 
     def document(self) -> dict[str, Any]:
         """Count, median and largest, and the bins that are not empty."""
-        bins = {int(place): int(self.bins[place]) for place in np.flatnonzero(self.bins)}
+        bins = {int(bin_ms): int(self.bins[bin_ms]) for bin_ms in np.flatnonzero(self.bins)}
         return {
             "count": sum(bins.values()),
             "median_ms": median_ms(bins),
             "largest_ms": round(self.largest_ms, 3),
-            "bins_ms": {str(place): count for place, count in bins.items()},
+            "bins_ms": {str(bin_ms): count for bin_ms, count in bins.items()},
         }
 
 
 def median_ms(bins: Mapping[int, int]) -> int:
     """The bin in which the middle one of all times stands; 0 when there are none."""
     middle, passed = (sum(bins.values()) + 1) // 2, 0
-    for place in sorted(bins):
-        passed += bins[place]
+    for bin_ms in sorted(bins):
+        passed += bins[bin_ms]
         if passed >= middle:
-            return place
+            return bin_ms
     return 0
 
 
@@ -108,7 +108,7 @@ class Tally:
 # What a soak may find wrong, and where it is kept: every kind counted, the first ones told in full.
 
 
-_TOLD = 50
+_MOST_ANOMALIES = 50
 
 
 class Wrong(StrEnum):
@@ -147,7 +147,7 @@ class Findings:
 
     def __init__(self) -> None:
         self.counts: Counter[Wrong] = Counter()
-        self.told: list[Anomaly] = []
+        self.anomalies: list[Anomaly] = []
         self.episode = 0
         self._began_ns = 0
 
@@ -158,9 +158,9 @@ class Findings:
     def add(self, wrong: Wrong, time_ns: int | None, text: str, count: int = 1) -> None:
         """Note one, or `count` alike."""
         self.counts[wrong] += count
-        if len(self.told) < _TOLD:
+        if len(self.anomalies) < _MOST_ANOMALIES:
             time_s = None if time_ns is None else (time_ns - self._began_ns) / 1e9
-            self.told.append(Anomaly(self.episode, time_s, wrong, text))
+            self.anomalies.append(Anomaly(self.episode, time_s, wrong, text))
 
 
 # --- Counts ----------------------------------------------------------------------------------------------------------

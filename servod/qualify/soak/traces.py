@@ -96,13 +96,13 @@ def shows(trace: BusSign, heard: Sequence[Heard], destroyed: int) -> bool:
 
 def _distances(heard: Iterable[Heard], can_id: int) -> list[int]:
     """From each frame with `can_id` to the next, in SYNCs between them."""
-    places, syncs = [], 0
+    sync_counts, syncs = [], 0
     for frame in heard:
         if frame.can_id == SYNC_ID:
             syncs += 1
         elif frame.can_id == can_id:
-            places.append(syncs)
-    return [later - earlier for earlier, later in pairwise(places)]
+            sync_counts.append(syncs)
+    return [later - earlier for earlier, later in pairwise(sync_counts)]
 
 
 class Listener(Port):

@@ -67,7 +67,7 @@ class WallSoak:
         """Raises Unreachable when the processes do not start."""
         folder.mkdir(parents=True, exist_ok=True)
         self.findings, self.tally = Findings(), Tally()
-        self._schedule, self._starved = ExcusedFaults(fault_bits(ALWAYS)), Starvation(time.monotonic_ns())
+        self._schedule, self._starvation = ExcusedFaults(fault_bits(ALWAYS)), Starvation(time.monotonic_ns())
         over = {"recorder": {"always": True, "max_file_mib": 16}}
         with contextlib.ExitStack() as stack:
             self._axis = ProcessAxis(nothing_yet(seed, proves=False), folder, over=over)
@@ -124,8 +124,8 @@ class WallSoak:
             self._befall(episode.fault, random.Random(episode.seed))  # noqa: S311
         if moves and self._state() == AxisState.ENABLED.name:
             self._end(episode)
-        self._starved.look(self._watched(), self._axis.now_ns())
-        self._rows.take(self._schedule, self._starved.explained, ended=False)
+        self._starvation.look(self._watched(), self._axis.now_ns())
+        self._rows.take(self._schedule, self._starvation.explained, ended=False)
 
     def finish(self) -> None:
         """Bring the axis to rest, end the daemon and check what it recorded last."""
@@ -189,7 +189,7 @@ class WallSoak:
         self._syncs_taken |= kind.takes_syncs
         injection = kind.injection(chance)
         listener = None if kind.expects else self._listen(injection)
-        self._starved.look(self._watched(), self._axis.now_ns())
+        self._starvation.look(self._watched(), self._axis.now_ns())
         injected_ns = self._axis.now_ns()
         self._schedule.add(injected_ns, kind.explained)
         self._act(injection)
@@ -233,9 +233,9 @@ class WallSoak:
             )
             return
         tally.found += 1
-        starved_ms = self._starved.waited_ms(self._watched())
+        waited_ms = self._starvation.waited_ms(self._watched())
         times = reaction_in(samples, injected_ns)
-        if check_reaction(kind, times, injected_ns, tally, self.findings, _GRACE_MS, starved_ms):
+        if check_reaction(kind, times, injected_ns, tally, self.findings, _GRACE_MS, waited_ms):
             self.tally.excused["reaction later than its bound"] += 1
 
     def _recover(self, recovery: Recovery) -> bool:
@@ -243,23 +243,23 @@ class WallSoak:
 
         Returns whether the first try did it.
         """
-        starved, why = False, ""
+        hungry, why = False, ""
         for attempt in range(_TRIES):
-            starved = starved or self._starved.hungry(self._watched())
+            hungry = hungry or self._starvation.hungry(self._watched())
             if recovery is Recovery.RESTART or attempt == _TRIES - 1:
                 self._end_session(_ENDS_AFTER_LOSS)
                 self.tally.restarts += 1
                 self._axis.machine.start_daemon()
             if self._enabled(recovery is not Recovery.NONE or attempt > 0):
-                self._tell_tries(recovery, attempt, starved, why)
+                self._report_tries(recovery, attempt, hungry, why)
                 return attempt == 0
             why = why or self._axis.refusal or self._faults()
         self.findings.add(Wrong.NOT_RECOVERED, self._axis.now_ns(), f"by {recovery}: {self._axis.refusal}")
         raise AnswerIsNo(f"episode {self.findings.episode}: the axis cannot be enabled any more")
 
-    def _tell_tries(self, recovery: Recovery, attempt: int, starved: bool, why: str) -> None:
+    def _report_tries(self, recovery: Recovery, attempt: int, hungry: bool, why: str) -> None:
         """More than one try is a finding, unless the processes were starved; then it is counted."""
-        if attempt and starved:
+        if attempt and hungry:
             self.tally.excused["recovered by another try"] += 1
         elif attempt:
             text = f"not by {recovery}, but at try {attempt + 1} of {_TRIES}: {why}"
@@ -292,24 +292,24 @@ class WallSoak:
     def _end_session(self, codes: tuple[int, ...]) -> None:
         """End the daemon as the service manager does, and hold its rows against what was heard on the bus."""
         machine = self._axis.machine
-        self._starved.look(self._watched(), self._axis.now_ns())
+        self._starvation.look(self._watched(), self._axis.now_ns())
         self._axis.leave()
         machine.send([Process.DAEMON], signal.SIGTERM)
         code = machine.wait(Process.DAEMON, 20.0)
         if code not in codes:
             self.findings.add(Wrong.STATE, self._axis.now_ns(), f"the daemon ended with exit code {code}")
         time.sleep(_HEARD_S)
-        self._starved.look(self._watched(), self._axis.now_ns())
+        self._starvation.look(self._watched(), self._axis.now_ns())
         heard, self._heard_before = self._heard.count - self._heard_before, self._heard.count
         overruns, self._overruns_before = self._heard.overruns - self._overruns_before, self._heard.overruns
-        self._rows.take(self._schedule, self._starved.explained, ended=True)
+        self._rows.take(self._schedule, self._starvation.explained, ended=True)
         self._rows.end_session(heard, self._syncs_taken or overruns > 0)
         self.tally.excused.update({"SYNC heard by a listener that was too slow": overruns} if overruns else {})
         self.tally.excused.update(self._rows.excused)
         self._rows.excused.clear()
         self._syncs_taken = False
         self._schedule.forget(self._axis.now_ns())
-        self._starved.explained.forget(self._axis.now_ns())
+        self._starvation.explained.forget(self._axis.now_ns())
 
 
 def _watch(duration_s: float, listener: BusListener | None) -> bool:

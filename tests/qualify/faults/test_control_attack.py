@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from servod.common.errors import AnswerIsNo
-from servod.qualify.bench.attack import measure, text, told
+from servod.qualify.bench.attack import measure, read_tallies, text
 from servod.qualify.bench.attackers import SILENT
 
 pytestmark = pytest.mark.alone
@@ -78,16 +78,16 @@ def test_attackers_without_a_daemon_say_that_they_did_nothing(tmp_path: Path) ->
     assert done.returncode == 1 and set(json.loads(done.stdout.splitlines()[-1])) >= {"idle", "flood", "endless"}
     (tmp_path / "log").write_text(done.stdout)
     with pytest.raises(AnswerIsNo, match="no attack of these kinds took place: idle, deaf, half, garbage"):
-        told(tmp_path / "log")
+        read_tallies(tmp_path / "log")
 
 
 def test_one_kind_of_attack_that_said_nothing_is_missed(figures: dict[str, Any], tmp_path: Path) -> None:
     log = tmp_path / "log"
     log.write_text(json.dumps(figures["attacks"]))
-    assert set(told(log)) == set(figures["attacks"])
+    assert set(read_tallies(log)) == set(figures["attacks"])
     log.write_text(json.dumps(figures["attacks"] | {"nested": {"connections": 3, "bytes": 0}}))
     with pytest.raises(AnswerIsNo, match="took place: nested"):
-        told(log)
+        read_tallies(log)
     log.write_text("a traceback")
     with pytest.raises(AnswerIsNo, match="did not tell what they did: a traceback"):
-        told(log)
+        read_tallies(log)

@@ -248,4 +248,4 @@ def test_what_belongs_to_the_bound_is_told_with_it() -> None:
     assert check_reaction(kind, ReactionTimes(115.0, 359.0), 0, FaultTally(), findings, 60.0, 10.0)
     assert not findings.counts
     check_reaction(kind, ReactionTimes(111.0, 359.0), 0, FaultTally(), findings, 60.0)
-    assert findings.told[0].text == "encoder cut off: command left after 111 ms, 110 ms allowed"
+    assert findings.anomalies[0].text == "encoder cut off: command left after 111 ms, 110 ms allowed"

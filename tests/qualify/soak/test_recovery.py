@@ -52,9 +52,9 @@ def test_another_try_is_found(
     for name, value in (("_axis", StoppedAxis(tries)), ("_settle", lambda: None), ("_watched", dict)):
         monkeypatch.setattr(soak, name, value, raising=False)
     starved = type("Hungry", (), {"hungry": lambda _self, _processes: hungry})()
-    monkeypatch.setattr(soak, "_starved", starved, raising=False)
+    monkeypatch.setattr(soak, "_starvation", starved, raising=False)
     first = (recovery is Recovery.NONE and tries == 0) or (recovery is not Recovery.NONE and tries == 1)
     assert soak._recover(recovery) is first
-    assert [finding.text for finding in soak.findings.told] == [found] * bool(found)
+    assert [finding.text for finding in soak.findings.anomalies] == [found] * bool(found)
     assert set(soak.findings.counts) == ({Wrong.NOT_RECOVERED} if found else set())
     assert soak.tally.excused.total() == (hungry and not first)

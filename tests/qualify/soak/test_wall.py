@@ -50,4 +50,4 @@ def test_a_listener_that_misses_a_sync_is_found(tmp_path: Path) -> None:
         axis.finish()
     finally:
         axis.close()
-    assert axis.findings.counts == {Wrong.SYNC: 1} or axis._heard.overruns > 0, axis.findings.told
+    assert axis.findings.counts == {Wrong.SYNC: 1} or axis._heard.overruns > 0, axis.findings.anomalies

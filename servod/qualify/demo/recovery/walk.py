@@ -47,7 +47,7 @@ from servod.lab.verify.certify import verify
 from servod.lab.verify.checks import LEAST_PLANTS
 
 #: Told what is done, and the share of the whole that is.
-Tell = Callable[[str, float], None]
+OnProgress = Callable[[str, float], None]
 
 #: Opens an enabled axis: joint, gain set, folder, seed of its noise.
 OpenAxis = Callable[[AxisModel, GainSet, Path, int], AbstractContextManager[AxisClient]]
@@ -169,30 +169,30 @@ def recover(
     effect: str,
     open_axis: OpenAxis,
     out: Path,
-    tell: Tell,
+    on_progress: OnProgress,
     seed: int = 1,
     effort: Effort = Effort(),
 ) -> Retrofit:
     """Run the whole story; files stay in `out`. Raises AnswerIsNo when a step's answer is no."""
     paper = ReferenceMotion.paper(effort.paper_s)
-    tell("design for what is believed", 0.02)
+    on_progress("design for what is believed", 0.02)
     write_bytes(out / "believed.yaml", axis_model_yaml(believed).encode())
     first = designed(believed, out / "believed.yaml", out / "gains_before.yaml", None, effort.plants)
     with socket_folder("servod-demo-") as folder:
-        tell("the axis as it is believed to be", 0.2)
+        on_progress("the axis as it is believed to be", 0.2)
         with open_axis(believed, first.gains, _folder(folder, "believed"), seed) as axis:
             before = moved(axis, paper)
         with open_axis(true, first.gains, _folder(folder, "true"), seed) as axis:
-            tell("the axis as it is", 0.25)
+            on_progress("the axis as it is", 0.25)
             concealed = moved(axis, paper)
-            recordings = _recorded(axis, concealed, out, tell, effort)
-            tell("diagnosis", 0.4)
+            recordings = _recorded(axis, concealed, out, on_progress, effort)
+            on_progress("diagnosis", 0.4)
             found, document = _diagnosed(believed, recordings, out / DIAGNOSIS)
-            tell("design for what was found", 0.65)
+            on_progress("design for what was found", 0.65)
             extended = _extended(believed, document, out)
             second = designed(load_axis_model(extended), extended, out / "gains_after.yaml", first.gains, effort.plants)
-            done = _deployed(axis, second.gains, tell)
-            tell("the axis under what was found", 0.95)
+            done = _deployed(axis, second.gains, on_progress)
+            on_progress("the axis under what was found", 0.95)
             after = moved(axis, paper)
     return Retrofit(effect, before, concealed, after, found, document, first, second, done)
 
@@ -203,10 +203,10 @@ def moved(axis: AxisClient, motion: ReferenceMotion) -> Rows:
     return moving(rows_of(axis.run(motion)))
 
 
-def _deployed(axis: AxisClient, gains: GainSet, tell: Tell) -> Deployment:
+def _deployed(axis: AxisClient, gains: GainSet, on_progress: OnProgress) -> Deployment:
     """Put the set on trial; again where it was turned down and the loop had skipped cycles, as deploy advises then."""
     for _ in range(_TRIALS):
-        done = deploy(axis, gains, lambda what, share: tell(f"deploy: {what}", 0.85 + 0.08 * share))
+        done = deploy(axis, gains, lambda what, share: on_progress(f"deploy: {what}", 0.85 + 0.08 * share))
         if done.proven or done.rows_after is None or not doubtful_timing(done.rows_after):
             break
     return done
@@ -242,11 +242,11 @@ def designed(
     raise AnswerIsNo(said)
 
 
-def _recorded(axis: AxisClient, tracked: Rows, out: Path, tell: Tell, effort: Effort) -> list[Path]:
+def _recorded(axis: AxisClient, tracked: Rows, out: Path, on_progress: OnProgress, effort: Effort) -> list[Path]:
     """The axis's own recordings: a part of (19), and motions that show more."""
     runs = {"paper": tracked[time_s(tracked) < effort.diagnosed_s]}
     for index, (name, positions) in enumerate(motions(effort.motion_s).items()):
-        tell(f"recording: {name}", 0.3 + 0.03 * index)
+        on_progress(f"recording: {name}", 0.3 + 0.03 * index)
         runs[name] = moved(axis, ReferenceMotion.table(positions.tolist()))
     paths = [out / "recordings" / f"{name}.mcap" for name in runs]
     for path, rows in zip(paths, runs.values(), strict=True):

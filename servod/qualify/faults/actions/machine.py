@@ -61,7 +61,7 @@ class SteppedAction(InjectionAction):
         """Let it happen to `axis` now; returns how often it took effect already."""
 
 
-class Tell(SteppedAction):
+class GiveCommand(SteppedAction):
     """A person gives a command."""
 
     op: OpName
@@ -217,7 +217,7 @@ class CounterWraps(SteppedAction):
 
 MACHINE_ACTIONS: dict[str, type[InjectionAction]] = {
     "gains": Gains,
-    "tell": Tell,
+    "tell": GiveCommand,
     "sine": Sine,
     "dies": Dies,
     "step": Step,
@@ -248,7 +248,7 @@ def _cut(path: Path) -> None:
     path.write_text(text[: len(text) // 2], encoding="utf-8")
 
 
-def _swapped(path: Path) -> None:
+def _swap(path: Path) -> None:
     aside = path.with_suffix(".aside")
     aside.write_bytes(_OTHER.read_bytes())
     aside.replace(path)
@@ -256,7 +256,7 @@ def _swapped(path: Path) -> None:
 
 _DAMAGE: dict[Damage, Callable[[Path], None]] = {
     Damage.CUT: _cut,
-    Damage.SWAPPED: _swapped,
+    Damage.SWAPPED: _swap,
     Damage.GONE: Path.unlink,
 }
 

@@ -72,17 +72,17 @@ def _equations(results: Results) -> Iterator[Claim]:
 
 def _programme(answer: ProgrammeAnswer) -> str:
     """Both regions' feedback or clashes, and the sampled loop."""
-    told = []
+    clauses = []
     for name, region in answer.regions.items():
         if region.position_nm_per_rad is None:
-            told.append(f"no feedback in region {'; '.join(region.clashes)}")
+            clauses.append(f"no feedback in region {'; '.join(region.clashes)}")
         else:
             gains = f"{region.position_nm_per_rad:.4g} N·m/rad and {region.velocity_nms_per_rad:.4g} N·m·s/rad"
-            told.append(f"region {name} {gains}")
+            clauses.append(f"region {name} {gains}")
     if answer.largest_pole is not None:
-        told.append(f"the largest pole of the sampled loop is {answer.largest_pole:.3g}")
-        told.append(f"(19) with {answer.rms_mrad:.4g} mrad RMS")
-    return ", ".join(told)
+        clauses.append(f"the largest pole of the sampled loop is {answer.largest_pole:.3g}")
+        clauses.append(f"(19) with {answer.rms_mrad:.4g} mrad RMS")
+    return ", ".join(clauses)
 
 
 def _slip(forms: TwoForms) -> str:
