@@ -40,11 +40,11 @@ def walk_in(folder: Path, told: list[str], cut: str = "") -> Walk:
 
     @contextmanager
     def progress(title: str) -> Iterator[OnProgress]:
-        def tell(_what: str, share: float) -> None:
+        def on_progress(_what: str, share: float) -> None:
             if title == cut and share > 0.0:
                 raise KeyboardInterrupt
 
-        yield tell
+        yield on_progress
 
     folder.mkdir(exist_ok=True)
     options = WalkOptions(plants=2, processes=1, least_plants=2, budget=6)

@@ -80,11 +80,11 @@ def walk_in(folder: Path, interrupted: str = "") -> Walk:
 
     @contextmanager
     def progress(title: str) -> Iterator[OnProgress]:
-        def tell(_what: str, share: float) -> None:
+        def on_progress(_what: str, share: float) -> None:
             if title == interrupted and share > 0.05:
                 raise KeyboardInterrupt
 
-        yield tell
+        yield on_progress
 
     options = WalkOptions(plants=2, processes=1, least_plants=2)
     return Walk(folder, AXIS, options, Questions(True, lambda _q: True), progress, lambda _line: None)
@@ -335,8 +335,8 @@ def test_the_progress_says_which_step_it_is_and_what_is_left(tmp_path: Path) -> 
     @dataclass(frozen=True)
     class Telling(Known):
         def run(self, walk: Walk) -> None:
-            with walk.progress(self.title) as tell:
-                tell("moving", 0.0)
+            with walk.progress(self.title) as on_progress:
+                on_progress("moving", 0.0)
             super().run(walk)
 
     said: list[str] = []

@@ -89,7 +89,7 @@ def test_ctrl_c_in_the_middle_of_an_experiment_switches_the_axis_off(tmp_path):
         link = DaemonAxis(client, load_config(axis.folder / "axis.yaml"))
         ramping = []
 
-        def tell(what: str, _share: float) -> None:
+        def on_progress(what: str, _share: float) -> None:
             if what == "break-away":
                 ramping.append(what)
                 signal.setitimer(signal.ITIMER_REAL, 0.7)
@@ -97,7 +97,7 @@ def test_ctrl_c_in_the_middle_of_an_experiment_switches_the_axis_off(tmp_path):
         before = signal.signal(signal.SIGALRM, signal.default_int_handler)
         try:
             with pytest.raises(KeyboardInterrupt):
-                identify(link, tmp_path / "recordings", tell)
+                identify(link, tmp_path / "recordings", on_progress)
         finally:
             signal.setitimer(signal.ITIMER_REAL, 0.0)
             signal.signal(signal.SIGALRM, before)

@@ -214,32 +214,35 @@ def test_a_fault_is_explained_in_its_time_and_no_longer() -> None:
 
 def test_a_process_that_got_no_turn_was_starved() -> None:
     begun_ns, cpus = time.monotonic_ns(), os.sched_getaffinity(0)
-    starved, one = Starvation(begun_ns), {min(cpus)}
+    starvation, one = Starvation(begun_ns), {min(cpus)}
     busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(3)]
     try:
         for process in busy:
             os.sched_setaffinity(process.pid, one)
         time.sleep(0.5)
-        starved.look({busy[0].pid: STARVED_CYCLE, busy[1].pid: STARVED_SUPERVISOR}, time.monotonic_ns())
+        starvation.look({busy[0].pid: STARVED_CYCLE, busy[1].pid: STARVED_SUPERVISOR}, time.monotonic_ns())
     finally:
         for process in busy:
             process.kill()
             process.wait()
-    assert starved.explained.at(np.array([begun_ns]))[0] == fault_bits(STARVED_CYCLE | STARVED_SUPERVISOR)
+    assert starvation.explained.at(np.array([begun_ns]))[0] == fault_bits(STARVED_CYCLE | STARVED_SUPERVISOR)
 
 
 def test_short_waits_of_many_processes_starve_none(monkeypatch: pytest.MonkeyPatch) -> None:
     waited_ms = {1: 0, 2: 0, 3: 0}
     monkeypatch.setattr("servod.qualify.soak.starvation.waited_ns", lambda pid: waited_ms[pid] * 1_000_000)
     monkeypatch.setattr("servod.qualify.soak.starvation.stolen_ns", lambda: 0)
-    starved, watched = Starvation(0), {1: STARVED_CYCLE, 2: STARVED_CYCLE, 3: STARVED_SUPERVISOR}
+    starvation, watched = Starvation(0), {1: STARVED_CYCLE, 2: STARVED_CYCLE, 3: STARVED_SUPERVISOR}
     waited_ms.update({1: 20, 2: 20, 3: 20})
-    assert starved.waited_ms(watched) == 60.0 and not starved.hungry(watched)
-    starved.look(watched, 10)
+    assert starvation.waited_ms(watched) == 60.0 and not starvation.hungry(watched)
+    starvation.look(watched, 10)
     waited_ms[3] += 26  # a piece of its own: only what the supervisor's waiting may cause
-    starved.look(watched, 20)
+    starvation.look(watched, 20)
     late = frozenset({FaultCode.DEADLINE_LATE})  # told of a single period, and nothing follows
-    assert starved.explained.at(np.array([5, 15])).tolist() == [fault_bits(late), fault_bits(late | STARVED_SUPERVISOR)]
+    assert starvation.explained.at(np.array([5, 15])).tolist() == [
+        fault_bits(late),
+        fault_bits(late | STARVED_SUPERVISOR),
+    ]
 
 
 def test_what_belongs_to_the_bound_is_told_with_it() -> None:

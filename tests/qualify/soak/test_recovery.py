@@ -51,8 +51,8 @@ def test_another_try_is_found(
     soak.findings, soak.tally = Findings(), Tally()
     for name, value in (("_axis", StoppedAxis(tries)), ("_settle", lambda: None), ("_watched", dict)):
         monkeypatch.setattr(soak, name, value, raising=False)
-    starved = type("Hungry", (), {"hungry": lambda _self, _processes: hungry})()
-    monkeypatch.setattr(soak, "_starvation", starved, raising=False)
+    starvation = type("Hungry", (), {"hungry": lambda _self, _processes: hungry})()
+    monkeypatch.setattr(soak, "_starvation", starvation, raising=False)
     first = (recovery is Recovery.NONE and tries == 0) or (recovery is not Recovery.NONE and tries == 1)
     assert soak._recover(recovery) is first
     assert [finding.text for finding in soak.findings.anomalies] == [found] * bool(found)

@@ -76,15 +76,15 @@ class _Guest:
 
 
 def _full(*guests: _Guest) -> ConnectedClients:
-    places = ConnectedClients()
+    slots = ConnectedClients()
     for guest in guests:
-        places.take(cast(Connection, guest))
-    return places
+        slots.take(cast(Connection, guest))
+    return slots
 
 
-def _leaves(places: ConnectedClients, pid: int, holder: _Guest | None = None, now_s: float = 100.0) -> _Guest | None:
+def _leaves(slots: ConnectedClients, pid: int, holder: _Guest | None = None, now_s: float = 100.0) -> _Guest | None:
     newcomer = Peer(pid, 0, frozenset())
-    return cast(_Guest | None, places.make_room(newcomer, cast(Connection | None, holder), int(now_s * 1e9)))
+    return cast(_Guest | None, slots.make_room(newcomer, cast(Connection | None, holder), int(now_s * 1e9)))
 
 
 def test_house_with_room_sends_nobody_away() -> None:
@@ -108,12 +108,12 @@ def test_who_commanded_or_stopped_a_moment_ago_leaves_after_all_others() -> None
     others = [_Guest(pid, now_ns, under_way=1) for pid in range(MAX_CLIENTS - 2)]
     stopped = _Guest(500, active_ns=50_000_000_000, commanded_ns=50_000_000_000)
     long_ago = _Guest(501, active_ns=39_000_000_000, commanded_ns=39_000_000_000)
-    places = _full(stopped, long_ago, *others)
-    assert _leaves(places, 999) is long_ago
+    slots = _full(stopped, long_ago, *others)
+    assert _leaves(slots, 999) is long_ago
     long_ago.active_ns, long_ago.under_way = now_ns, 1
-    assert _leaves(places, 999) in [*others, long_ago]
-    places = _full(*(_Guest(pid, now_ns - pid, commanded_ns=now_ns) for pid in range(MAX_CLIENTS)))
-    assert _leaves(places, 999) is not None
+    assert _leaves(slots, 999) in [*others, long_ago]
+    slots = _full(*(_Guest(pid, now_ns - pid, commanded_ns=now_ns) for pid in range(MAX_CLIENTS)))
+    assert _leaves(slots, 999) is not None
 
 
 def test_who_stopped_the_axis_is_not_sent_away_by_a_crowd_that_only_looks(served: Served) -> None:
@@ -129,18 +129,18 @@ def test_who_stopped_the_axis_is_not_sent_away_by_a_crowd_that_only_looks(served
 def test_idle_one_leaves_before_an_active_crowd_and_that_before_an_active_single_one() -> None:
     single = [_Guest(pid, active_ns=99_000_000_000) for pid in range(100, 100 + MAX_CLIENTS - 10)]
     crowd = [_Guest(7, active_ns=99_500_000_000 + n) for n in range(10)]
-    places = _full(*single, *crowd)
-    assert _leaves(places, 999) is crowd[0]
+    slots = _full(*single, *crowd)
+    assert _leaves(slots, 999) is crowd[0]
     single[3].active_ns = 97_000_000_000
-    assert _leaves(places, 999) is single[3]
+    assert _leaves(slots, 999) is single[3]
 
 
 def test_nobody_who_is_active_makes_room_for_a_larger_crowd() -> None:
     now_ns = 99_000_000_000
     crowd = [_Guest(98, now_ns, under_way=1) for _ in range(3)]
-    places = _full(*crowd, *(_Guest(pid, now_ns) for pid in range(MAX_CLIENTS - 3)))
+    slots = _full(*crowd, *(_Guest(pid, now_ns) for pid in range(MAX_CLIENTS - 3)))
     with pytest.raises(Unreachable, match="all places are taken, 3 of them by process 98"):
-        _leaves(places, 98)
+        _leaves(slots, 98)
 
 
 def test_of_a_process_with_its_share_its_own_oldest_leaves() -> None:

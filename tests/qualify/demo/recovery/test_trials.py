@@ -36,8 +36,8 @@ class Trial:
 def test_only_lateness_earns_another_trial(trials: list[Trial], used: int, monkeypatch: pytest.MonkeyPatch) -> None:
     left = iter(trials)
 
-    def deploy(_axis: Any, _gains: Any, tell: walk.OnProgress) -> Trial:
-        tell("verdict", 1.0)
+    def deploy(_axis: Any, _gains: Any, on_progress: walk.OnProgress) -> Trial:
+        on_progress("verdict", 1.0)
         return next(left)
 
     monkeypatch.setattr(walk, "deploy", deploy)

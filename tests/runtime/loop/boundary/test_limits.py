@@ -281,18 +281,18 @@ def test_an_old_torque_is_not_judged() -> None:
     assert set(said(armed(), 0.5, 200, age_cycles=1)) == {0}
 
 
-@pytest.mark.parametrize("told_nm", [0.5, -0.5])
-def test_a_drive_that_says_it_limits_the_torque_may_give_less_and_never_more(told_nm: float) -> None:
+@pytest.mark.parametrize("commanded_nm", [0.5, -0.5])
+def test_a_drive_that_says_it_limits_the_torque_may_give_less_and_never_more(commanded_nm: float) -> None:
     def shown(torque_nm: float) -> set[int]:
-        limits, seen = armed(told_nm), set()
+        limits, seen = armed(commanded_nm), set()
         for _ in range(200):
-            limits.limit_torque(told_nm, DT_S)
+            limits.limit_torque(commanded_nm, DT_S)
             seen |= set(said(limits, torque_nm, 1, status_word=0x0A37))
         return seen
 
-    assert shown(0.0) == shown(0.5 * told_nm) == shown(told_nm) == {0}
-    beyond = math.copysign(1.01 * MISMATCH, told_nm)
-    assert shown(told_nm + beyond) == shown(-beyond) == {0, BENT}
+    assert shown(0.0) == shown(0.5 * commanded_nm) == shown(commanded_nm) == {0}
+    excess_nm = math.copysign(1.01 * MISMATCH, commanded_nm)
+    assert shown(commanded_nm + excess_nm) == shown(-excess_nm) == {0, BENT}
 
 
 def test_the_torque_is_held_against_the_commands_of_the_last_cycles() -> None:
