@@ -38,7 +38,7 @@ def preset(
     from servod.runtime.fieldbus.master import Master
 
     axis = load_config(config)
-    lock = InstanceLock(axis)
+    lock = InstanceLock(axis, passing=True)
     try:
         with closing(Master(axis, open_bus(axis.bus), WallClock(), threaded=False)) as master:
             counts, reads_rad = master.preset_encoder(position_rad)

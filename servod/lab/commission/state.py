@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from pydantic import Field
 from servod.common import files
 from servod.common.errors import BadInput, Unreachable
 from servod.common.files import read_json, write_bytes, write_file
-from servod.common.portable import lock_file
+from servod.common.portable import lock_folder
 from servod.common.yaml import Strict, validate
 
 # --- Files of a walk -------------------------------------------------------------------------------------------------
@@ -55,7 +56,6 @@ def read_walk_json(path: Path) -> Any:
 
 
 STATE = "state.json"
-LOCK = ".lock"
 
 
 class StepRecord(Strict):
@@ -174,13 +174,23 @@ class State:
 
 @contextlib.contextmanager
 def sole_walk(folder: Path) -> Iterator[None]:
-    """Nobody else works in the folder meanwhile; the lock ends with the process. Raises Unreachable."""
-    with (folder / LOCK).open("w") as file:
-        try:
-            lock_file(file, wait=False)
-        except OSError:
-            raise Unreachable(f"--out {folder}: another servoctl commission is at work there") from None
+    """Nobody else works in the folder meanwhile; the lock ends with the process. Raises Unreachable.
+
+    A walk that was refused before it wrote anything leaves nothing: a state alone is of no step.
+    """
+    try:
+        lock = lock_folder(folder)
+    except OSError:
+        raise Unreachable(f"--out {folder}: another servoctl commission is at work there") from None
+    try:
         yield
+    except (BadInput, Unreachable):
+        with contextlib.suppress(OSError):
+            if [entry.name for entry in folder.iterdir()] == [STATE]:
+                (folder / STATE).unlink()
+        raise
+    finally:
+        os.close(lock)
 
 
 def digest(value: Any) -> str:

@@ -32,14 +32,20 @@ _PID_BYTES = 20
 class _Lock:
     """Locks of one process; `release`, the end of a `with` block or of the process gives them back.
 
-    The files stay: whoever takes one away lets two think that they own what it stands for, until `keep` is called.
+    The files stay, and are made again by `keep` where somebody else took one away. Those of a command that comes and
+    goes are taken away by itself while it still holds them, where there was none before.
     """
 
-    def __init__(self, *wanted: tuple[str, Path]) -> None:
-        """What is owned, and its file. Raises Unreachable, with who stands in the way, when one cannot be had."""
+    def __init__(self, *wanted: tuple[str, Path], passing: bool = False) -> None:
+        """What is owned, and its file; `passing`: of a command that comes and goes.
+
+        Raises Unreachable, with who stands in the way, when one cannot be had.
+        """
         self._files: dict[tuple[str, Path], int] = {}
+        self._made: dict[Path, list[Path]] = {}  # file -> what was not there of it and its folders
         try:
             for what, path in wanted:
+                self._made[path] = [one for one in (path, *path.parents) if passing and not os.path.lexists(one)]
                 self._files[what, path] = _taken(what, path)
         except Unreachable:
             self.release()
@@ -61,26 +67,48 @@ class _Lock:
     def release(self) -> None:
         """Give the locks back."""
         while self._files:
-            os.close(self._files.popitem()[1])
+            (_, path), file = self._files.popitem()
+            if _is_at(path, file):
+                _take_away(self._made[path])
+            os.close(file)
 
 
 class InstanceLock(_Lock):
     """What a daemon owns: its control socket and its bus."""
 
-    def __init__(self, config: AxisConfig) -> None:
+    def __init__(self, config: AxisConfig, passing: bool = False) -> None:
         socket = config.control.socket.resolve()
-        super().__init__((f"control socket {socket}", _beside(socket)), _of_bus(config.bus))
+        super().__init__((f"control socket {socket}", _beside(socket)), _of_bus(config.bus), passing=passing)
 
 
 class BusLock(_Lock):
     """The bus alone, for a program that uses it for a moment."""
 
     def __init__(self, bus: BusConfig) -> None:
-        super().__init__(_of_bus(bus))
+        super().__init__(_of_bus(bus), passing=True)
+
+
+def _take_away(made: list[Path]) -> None:
+    """A file, and the folders above it that are empty now."""
+    with contextlib.suppress(OSError):
+        for path in made:
+            path.rmdir() if path.is_dir() else path.unlink()
 
 
 def _taken(what: str, path: Path) -> int:
     """The file, locked for this process. Raises Unreachable."""
+    while True:
+        file = _locked(what, path)
+        if _is_at(path, file):
+            break
+        os.close(file)  # who had it until now has taken the file away
+    with contextlib.suppress(OSError):  # a full disk: it is ours all the same, only nobody can tell whose
+        os.pwrite(file, f"{os.getpid()}\n".ljust(_PID_BYTES).encode(), 0)
+    return file
+
+
+def _locked(what: str, path: Path) -> int:
+    """A file that stood at `path`, locked for this process. Raises Unreachable."""
     try:
         file = _open(path)
     except OSError as error:
@@ -92,8 +120,6 @@ def _taken(what: str, path: Path) -> int:
         holder = os.pread(file, _PID_BYTES, 0).decode(errors="replace").strip() or "unknown"
         os.close(file)
         raise Unreachable(f"{what}: another servod (process {holder}) owns it") from None
-    with contextlib.suppress(OSError):  # a full disk: it is ours all the same, only nobody can tell whose
-        os.pwrite(file, f"{os.getpid()}\n".ljust(_PID_BYTES).encode(), 0)
     return file
 
 

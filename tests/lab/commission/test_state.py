@@ -192,6 +192,21 @@ def test_one_walk_at_a_time(tmp_path: Path) -> None:
         pass
 
 
+def test_a_walk_that_is_refused_leaves_nothing(tmp_path: Path) -> None:
+    class Refusing(Copy):
+        def inputs(self, _walk: Walk) -> dict[str, Any]:
+            raise BadInput("standard input", "no terminal to ask at", "--yes")
+
+    foreign = tmp_path / "foreign"
+    foreign.mkdir()
+    (foreign / "one.txt").write_text("mine")
+    for folder, step in ((tmp_path / "new", Refusing("one", None, [])), (foreign, Copy("one", None, []))):
+        with pytest.raises(BadInput):
+            run(walk(folder), (step,))
+    assert not list((tmp_path / "new").iterdir())
+    assert [entry.name for entry in foreign.iterdir()] == ["one.txt"]
+
+
 def test_a_kill_between_file_and_state_only_repeats_the_step(tmp_path: Path) -> None:
     runs: list[str] = []
     run(walk(tmp_path), chain(runs))

@@ -9,7 +9,8 @@ import stat
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -58,16 +59,49 @@ def test_other_bus_than_a_virtual_one_is_locked_in_the_runtime_folder(runtime: P
         pass
 
 
+@pytest.mark.parametrize("command", [BusLock, partial(InstanceLock, passing=True)])
+def test_a_command_that_comes_and_goes_takes_away_the_files_that_it_made(
+    command: Callable[..., BusLock | InstanceLock], tmp_path: Path
+) -> None:
+    axis = axis_config(tmp_path / "new" / "a.sock", tmp_path / "new" / "deep" / "bus")
+    given = axis.bus if command is BusLock else axis
+    with command(given):
+        assert (tmp_path / "new" / "deep" / "bus.lock").exists()
+    assert not list(tmp_path.iterdir())
+    InstanceLock(axis).release()
+    with command(given):
+        pass
+    assert (tmp_path / "new" / "a.sock.lock").exists() and (tmp_path / "new" / "deep" / "bus.lock").exists()
+
+
+def test_a_lock_on_a_file_that_was_taken_away_meanwhile_is_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another gives its lock back, and takes the file away, between our opening and our locking."""
+    bus = BusConfig(channel=str(tmp_path / "bus"))
+    other, opened = BusLock(bus), lock._open
+
+    def late(path: Path) -> int:
+        file = opened(path)
+        other.release()
+        return file
+
+    monkeypatch.setattr(lock, "_open", late)
+    with BusLock(bus), pytest.raises(Unreachable, match="owns it"):
+        BusLock(bus)
+
+
 def test_nobody_outside_the_group_may_open_a_lock(runtime: Path) -> None:
     axis = axis_config(runtime / "axis.sock", runtime / "vbus0")
     before = os.umask(0)
     try:
         with InstanceLock(axis), BusLock(CAN):
             made = sorted(runtime.glob("*.lock"))
+            rights = {stat.S_IMODE(path.stat().st_mode) for path in made}
     finally:
         os.umask(before)
     assert [path.name.split("-")[0] for path in made] == ["axis.sock.lock", "bus", "vbus0.lock"]
-    assert {stat.S_IMODE(path.stat().st_mode) for path in made} == {0o660}
+    assert rights == {0o660}
 
 
 def test_abstract_name_that_somebody_binds_keeps_no_daemon_from_its_start(runtime: Path) -> None:
@@ -145,8 +179,8 @@ attempt()
 
 
 def test_files_that_may_not_be_opened_are_told_with_their_owner_in_one_line(runtime: Path) -> None:
-    with BusLock(CAN):
-        (file,) = runtime.glob("*.lock")
+    os.close(lock._taken(*lock._of_bus(CAN)))  # as a daemon leaves it
+    (file,) = runtime.glob("*.lock")
     if os.geteuid() != 0:  # nobody to change to: a file that not even its owner may open
         file.chmod(0)
 
