@@ -15,7 +15,7 @@ import pytest
 from servod.cli.app import run
 from servod.common.faults import FAULTS, FaultCode
 from servod.formats.config import RecorderConfig
-from servod.formats.recording.incidents import Incident, Seen, newest
+from servod.formats.recording.incidents import Incident, Seen, moment, newest
 from servod.formats.recording.run_mark import RunMark
 from servod.runtime.daemon.fault_watch import FaultWatch
 from servod.runtime.daemon.health import Health
@@ -130,7 +130,24 @@ def test_a_run_without_an_orderly_end_is_among_what_happened(folder: Path, capsy
     assert "damaged.run.json" in document["not_read"][0]
     assert run(["faults", "--recordings", str(folder)]) == 0
     shown = capsys.readouterr().out
-    assert shown.count("servod ended without an orderly stop") == 2 and "[between 20" in shown
+    assert shown.count("servod ended without an orderly stop") == 2 and "[last known to live at 20" in shown
+
+
+def test_the_time_of_a_loss_is_not_that_of_who_asks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(ZeroDivisionError), RunMark(tmp_path, "joint"):
+        raise ZeroDivisionError
+    now_ns, asked = time.time_ns(), list[dict[str, Any]]()
+    seen = moment((tmp_path / "joint.run.json").stat().st_mtime_ns)
+    for later_s in (3600, 7200):
+        monkeypatch.setattr(time, "time_ns", lambda later_s=later_s: now_ns + later_s * 10**9)
+        asked += told(["--recordings", str(tmp_path)], capsys)["incidents"]
+    assert [(row["time"], row["detail"]) for row in asked] == [(seen, f"last known to live at {seen}")] * 2
+    with RunMark(tmp_path, "joint"):
+        monkeypatch.setattr(time, "time_ns", lambda: now_ns + 9000 * 10**9)
+        (kept,) = told(["--recordings", str(tmp_path)], capsys)["incidents"]
+    assert kept["detail"].endswith(f", found ended by the start at {moment(now_ns + 7200 * 10**9)}")
 
 
 def test_no_fault_is_an_answer(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -24,6 +24,7 @@ from servod.formats.recording.run_mark import ENDING, AbruptEnd, abrupt_ends
 #: A fault that comes later than this after the one before it has a cause of its own.
 QUIET_NS = 10 * NS_PER_S
 _MOST_FAULTS = 100
+_NEVER_NS = 2**63
 _ENABLING = 1  # servod.runtime.loop.axis_state.AxisState, which stands above
 _FILE = re.compile(r"(?P<axis>.+)-fault-(?P<stamp>\d{8}-\d{6})-\w+?(-\d+)?\.mcap")
 _LINE = re.compile(r"\bfault (?P<code>[A-Z_]+) \((?P<reaction>[A-Z_]+)\): (?P<text>.*)")
@@ -162,15 +163,21 @@ def _between(text: str, cause: str) -> str:
     return match[1] if match else ""
 
 
-def of_abrupt_end(end: AbruptEnd, axis: str = "") -> Incident:
-    """The end of a run without an orderly stop, at the time when the daemon was last seen alive."""
-    between = f"between {moment(end.seen_ns)} and {moment(end.found_ns)}"
-    return Incident(axis, [Seen(end.seen_ns, FaultCode.DAEMON_LOST, between)])
+def of_abrupt_end(end: AbruptEnd, axis: str = "", now_ns: int = _NEVER_NS) -> Incident:
+    """The end of a run without an orderly stop, at the time when the daemon was last seen alive.
+
+    When it was found ended says something only where a next start found it: from `now_ns` on, that is who asks.
+    """
+    known = f"last known to live at {moment(end.seen_ns)}"
+    if end.found_ns < now_ns:
+        known += f", found ended by the start at {moment(end.found_ns)}"
+    return Incident(axis, [Seen(end.seen_ns, FaultCode.DAEMON_LOST, known)])
 
 
 def of_mark(path: Path) -> list[Incident]:
     """The ends without an orderly stop that the mark of an axis's runs tells. Raises BadInput."""
-    return [of_abrupt_end(end, path.name.removesuffix(ENDING)) for end in abrupt_ends(path, time.time_ns())]
+    now_ns = time.time_ns()
+    return [of_abrupt_end(end, path.name.removesuffix(ENDING), now_ns) for end in abrupt_ends(path, now_ns)]
 
 
 def marks(folder: Path, axis: str | None = None) -> list[Path]:
