@@ -30,10 +30,11 @@ from servod.cli.common import begin_command, drop_empty_folders, json_is_printed
 from servod.cli.groups import NEXT, Grouped, modules
 from servod.client.control import Refused
 from servod.common.errors import AnswerIsNo, BadInput, Details, ServodError, Unreachable, details, one_line
-from servod.common.files import BadFile
+from servod.common.files import BadFile, unwritable
 
 #: Windows says EINVAL of a pipe whose reader has gone.
 _GONE = {errno.EPIPE, errno.EINVAL} if sys.platform == "win32" else {errno.EPIPE}
+_INSTALL_COMPLETION = "--install-completion"
 _NOBODY_TAKES = {errno.ENOSPC, errno.EIO, errno.EBADF, *_GONE}
 
 app = typer.Typer(
@@ -120,6 +121,8 @@ def run(arguments: list[str]) -> int:
     except (Exception, KeyboardInterrupt) as error:
         if isinstance(error, OSError) and _is_of_output(error):
             raise
+        if isinstance(error, OSError) and _INSTALL_COMPLETION in arguments:  # typer's, which writes to the home
+            error = unwritable(error.filename or Path.home(), error)
         return complain(error, arguments)
     finally:
         drop_empty_folders()

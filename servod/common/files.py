@@ -76,6 +76,8 @@ def _sentence(where: str | Path, error: Exception, writing: bool) -> str:
     number = getattr(error, "errno", None)
     if number == errno.EACCES and os.path.isdir(where):  # noqa: PTH112  (so Windows says it; never raises)
         number = errno.EISDIR
+    if number == errno.ENOENT and writing and os.path.isdir(os.path.dirname(where)):  # noqa: PTH112, PTH120
+        number = None  # a file system that takes no files: /proc
     if number in _SENTENCES:
         return _SENTENCES[number][writing]
     if isinstance(error, OSError):

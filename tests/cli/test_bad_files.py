@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 from pathlib import Path
 
 import pytest
@@ -78,6 +79,16 @@ def test_commands_say_it_in_a_sentence(
     assert told in line
     assert "; allowed:" not in line
     assert not any(text in line for text in ("No such", "Not a dir", "Is a dir", "File exists", "Errno"))
+
+
+@pytest.mark.parametrize("home", ["/proc", "/sys", "model.yaml"])
+def test_a_home_that_takes_no_completion_is_told_with_the_file(
+    home: str, files: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("HOME", home if home.startswith("/") else str(files / home))
+    assert run(["--install-completion", "bash"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert re.match(rf"servoctl: \S*{home}(/\.bashrc)?: \w", line) and "folder to write it in" not in line
 
 
 def test_every_error_of_the_system_has_a_sentence() -> None:
