@@ -48,8 +48,10 @@ def guard_test(
     from servod.runtime.daemon.guard_test import GuardTest, keep_proof
     from servod.runtime.daemon.lock import InstanceLock
     from servod.runtime.fieldbus.bus.open import open_bus
+    from servod.runtime.fieldbus.master.planned import check_interface
 
     axis = load_config(config)
+    check_interface(axis.bus.interface, f"{config}: bus.interface")
     for number in _ENDS:  # as Ctrl-C: the drive is switched off before this ends
         signal.signal(number, _end)
     with InstanceLock(axis, passing=True):

@@ -36,8 +36,10 @@ def preset(
     from servod.runtime.daemon.lock import InstanceLock
     from servod.runtime.fieldbus.bus.open import open_bus
     from servod.runtime.fieldbus.master import Master
+    from servod.runtime.fieldbus.master.planned import check_interface
 
     axis = load_config(config)
+    check_interface(axis.bus.interface, f"{config}: bus.interface")
     lock = InstanceLock(axis, passing=True)
     try:
         with closing(Master(axis, open_bus(axis.bus), WallClock(), threaded=False)) as master:

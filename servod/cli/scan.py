@@ -44,6 +44,10 @@ def scan(
     as_json: JsonOption = False,
 ) -> None:
     """Scan the bus."""
+    if interface is not None:
+        from servod.runtime.fieldbus.master.planned import check_interface
+
+        check_interface(interface, "--interface")
     if interface is not None and channel is None:
         raise BadInput(f"--interface {interface}", "no --channel", "--channel with the interface's name or socket too")
     nodes = _through_daemon(socket) if channel is None else _on_bus(interface or "socketcan", channel, bit_rate, socket)

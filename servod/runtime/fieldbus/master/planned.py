@@ -136,7 +136,7 @@ def check_names(config: AxisConfig, source: str) -> list[str]:
     file stands in place of a folder. A control group that is missing is a note: the machine that checks need not be the
     one that runs.
     """
-    _check_interface(config.bus.interface, source)
+    check_interface(config.bus.interface, f"{source}: bus.interface")
     for key, folder in {"gains": config.gains.directory, "recorder": config.recorder.directory}.items():
         file = next((path for path in (folder, *folder.parents) if is_there(path)), folder)
         if is_there(file) and not file.is_dir():
@@ -157,14 +157,15 @@ def check_names(config: AxisConfig, source: str) -> list[str]:
     return []
 
 
-def _check_interface(interface: str, source: str) -> None:
+def check_interface(interface: str, where: str) -> None:
+    """Raise BadInput, with those that there are, for a bus interface that nobody knows."""
     if interface in _OWN_INTERFACES:
         return
     from can import VALID_INTERFACES
 
     if interface not in VALID_INTERFACES:
         names = ", ".join(sorted({*_OWN_INTERFACES, *VALID_INTERFACES}))
-        raise BadInput(f"{source}: bus.interface", interface, names)
+        raise BadInput(where, interface, names)
 
 
 def reaction_s(config: AxisConfig, plan: NodePlan | None = None) -> float:
