@@ -12,6 +12,7 @@ import typer
 
 from servod.cli.common import JsonOption, example, print_json
 from servod.common.errors import BadInput
+from servod.common.files import named_in
 
 if TYPE_CHECKING:
     from servod.formats.config import AxisConfig
@@ -160,11 +161,14 @@ def _check_axis(file: Path) -> dict[str, Any]:
         load_quirks(config.quirks)
     except BadInput as error:
         raise BadInput(f"{file}: {error.where}", error.found, error.allowed) from None
-    for eds in (config.amplifier.eds, config.encoder.eds):
+    for device, eds in (("amplifier", config.amplifier.eds), ("encoder", config.encoder.eds)):
         if eds is not None:
-            _check_eds(Path(eds))
-    require_fit(load_gains(config.gains.initial), config, str(config.gains.initial))
-    with_expected(config)
+            with named_in(f"{file}: {device}.eds"):
+                _check_eds(Path(eds))
+    with named_in(f"{file}: gains.initial"):
+        require_fit(load_gains(config.gains.initial), config, str(config.gains.initial))
+    with named_in(f"{file}: model"):
+        with_expected(config)
     notes += [*_open_wires(config), *brake_notes(config)]
     load = planned_bus_load(config, str(file))
     where = f"{config.bus.interface} {config.bus.channel}"

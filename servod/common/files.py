@@ -61,6 +61,16 @@ def unwritable(where: str | Path, error: Exception) -> BadFile:
     return BadFile(str(where), _sentence(where, error, writing=True), "a file that can be written")
 
 
+@contextlib.contextmanager
+def named_in(where: str) -> Iterator[None]:
+    """A file that cannot be had in the block is told with the place that names it: "axis.yaml: gains.initial"."""
+    try:
+        yield
+    except BadFile as error:
+        error.where, error.args = f"{where}: {error.where}", (f"{one_line(where)}: {error}",)
+        raise
+
+
 def is_there(path: Path) -> bool:
     """Whether something is there, as far as one may look; never raises."""
     return os.path.exists(path)  # noqa: PTH110  (Path.exists raises where a folder may not be searched)

@@ -22,7 +22,7 @@ from servod.common.clock import WallClock
 from servod.common.end_signals import on_end_signals, restore_inherited_signals
 from servod.common.errors import BadInput, ServodError, Unreachable
 from servod.common.faults import FaultCode, fault_text
-from servod.common.files import reason
+from servod.common.files import named_in, reason
 from servod.common.yaml import read_text
 from servod.formats.config import AxisConfig, load_config
 from servod.formats.config_guards import weakened
@@ -59,9 +59,11 @@ def check(path: Path) -> AxisConfig:
     config = load_config(path)
     for note in check_names(config, str(path)):
         log.warning("%s", note)
-    require_fit(load_gains(config.gains.initial), config, str(config.gains.initial))
+    with named_in(f"{path}: gains.initial"):
+        require_fit(load_gains(config.gains.initial), config, str(config.gains.initial))
     if config.model is not None:
-        load_axis_model(config.model)
+        with named_in(f"{path}: model"):
+            load_axis_model(config.model)
     planned_bus_load(config, str(path))
     narrowed_by_stop(config)
     return config

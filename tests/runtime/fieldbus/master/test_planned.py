@@ -68,3 +68,15 @@ def test_a_file_in_place_of_a_folder_is_refused_before_the_axis_begins(
     configuration.write_text(json.dumps(sections))
     with pytest.raises(BadInput, match=rf"axis.yaml: {section}.directory: found {file}, which is a file"):
         check(configuration)
+
+
+@pytest.mark.parametrize("key", ["gains.initial", "model"])
+def test_a_missing_file_is_told_with_the_key_that_names_it(key: str, tmp_path: Path) -> None:
+    file = configured(tmp_path, 1_000_000)
+    sections = json.loads(file.read_text())
+    section, _, name = key.rpartition(".")
+    (sections[section] if section else sections)[name] = "none.yaml"
+    file.write_text(json.dumps(sections))
+    with pytest.raises(BadInput) as caught:
+        check(file)
+    assert str(caught.value) == f"{file}: {key}: {tmp_path / 'none.yaml'}: there is no such file"
