@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import sys
 import textwrap
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from servod.cli.common import JsonOption, example, print_json
-from servod.common.errors import BadInput
+from servod.common.errors import BadInput, details
 from servod.common.files import named_in
 
 if TYPE_CHECKING:
@@ -89,11 +90,33 @@ def check(
     files: Annotated[list[Path], typer.Argument(help="Files to check.", metavar="FILE...")],
     as_json: JsonOption = False,
 ) -> None:
-    """Check files; the first mistake ends the command with exit code 2, a warning does not."""
-    found = [{"file": str(file), **_check(file)} for file in files]
+    """Check all files; a mistake in any of them makes the exit code 2, a warning does not."""
+    refused: list[BadInput] = []
+    found = [{"file": str(file), **_check_or_tell(file, refused)} for file in files]
+    if refused and len(files) == 1:
+        raise refused[0]
     if as_json:
         print_json({"files": found})
-        return
+    else:
+        _print_checked([row for row in found if row["error"] is None])
+    for error in refused[:-1]:
+        print(f"servoctl: {error}", file=sys.stderr)
+    if refused:
+        raise refused[-1]
+
+
+def _check_or_tell(file: Path, refused: list[BadInput]) -> dict[str, Any]:
+    """The row of a file; what is wrong with it goes into `refused`, too."""
+    try:
+        return {**_check(file), "error": None}
+    except BadInput as error:
+        refused.append(error)
+        told = {"message": str(error), **details(error)._asdict()}
+        return {"kind": None, "note": "", "warnings": [], "error": told}
+
+
+def _print_checked(found: list[dict[str, Any]]) -> None:
+    """A line for each file without mistakes, and its warnings."""
     for row in found:
         note = str(row["note"]).replace("; stopping:", "\n  stopping:")
         print(f"{row['file']}: {row['kind']}, no mistakes" + (f"; {note}" if note else ""))

@@ -59,13 +59,23 @@ def test_the_channel_of_a_real_bus_is_no_path(tmp_path: Path) -> None:
     assert load_config(file).bus.channel == "can0"
 
 
-def test_several_files_are_checked_in_order_and_the_first_mistake_ends_it(
+def test_several_files_are_checked_in_order_and_each_mistake_is_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    bad = tmp_path / "bad.yaml"
+    bad, none = tmp_path / "bad.yaml", tmp_path / "none.yaml"
     bad.write_text("inertia: -1\n")
-    assert run(["config", "check", str(SHIPPED[0]), str(bad)]) == 2
-    assert "bad.yaml: inertia" in capsys.readouterr().err
+    words = ["config", "check", str(bad), str(SHIPPED[0]), str(none)]
+    assert run(words) == 2
+    shown = capsys.readouterr()
+    assert shown.out.startswith(f"{SHIPPED[0]}: axis model, no mistakes")
+    first, second = shown.err.splitlines()
+    assert first.startswith(f"servoctl: {bad}: inertia") and second == f"servoctl: {none}: there is no such file"
+    assert run([*words, "--json"]) == 2
+    shown = capsys.readouterr()
+    rows = json.loads(shown.out)["files"]
+    told = [row["error"] and f"servoctl: {row['error']['message']}" for row in rows]
+    assert told == [first, None, second] and shown.err.splitlines() == [first, second]
+    assert [row["kind"] for row in rows] == [None, "axis model", None]
 
 
 def _changed(gains: GainSet, **update: Any) -> GainSet:
