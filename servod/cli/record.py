@@ -30,7 +30,12 @@ def start(
     as_json: JsonOption = False,
 ) -> None:
     """Start a recording."""
-    result = ask(socket, "record_start", path=name)
+    try:
+        result = ask(socket, "record_start", path=name)
+    except BadInput as error:
+        if error.where != "record_start: path":
+            raise
+        raise BadInput("--name", error.found, error.allowed) from None
     report(result, f"recording to {result['path']}", as_json)
 
 

@@ -13,9 +13,12 @@ import pytest
 import yaml
 
 from servod.cli.app import run
-from servod.common.errors import BadInput
+from servod.client.control import RemoteBadInput
+from servod.common.errors import BadInput, details
+from servod.formats.config import RecorderConfig
 from servod.formats.gains.gain_set import parse_gains
 from servod.lab.commission.state import State
+from servod.runtime.daemon.recorder import RecordingFiles
 from tests.formats.gains import good
 from tests.fuzz.recordings import recorded
 
@@ -124,3 +127,22 @@ def test_a_number_that_is_not_finite_is_told_with_its_key(tmp_path: Path, capsys
         words = ["--amplitude", "0.1", "--frequency", "inf", "--duration", "1", "--no-wait", "--socket", str(path)]
         assert run(["track", "sine", *words]) == 2
     assert "track: frequency_hz: found inf; allowed: finite numbers" in capsys.readouterr().err
+
+
+def test_a_name_of_a_recording_that_is_refused_is_told_by_its_option(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = RecordingFiles(RecorderConfig(directory=tmp_path), "axis")
+
+    def daemon(_socket: Path, _verb: str, path: str) -> dict[str, str]:
+        try:
+            return {"path": str(files.recording(path))}
+        except BadInput as error:
+            raise RemoteBadInput(str(error), *details(error)) from None
+
+    monkeypatch.setattr("servod.cli.record.ask", daemon)
+    assert run(["record", "start", "--name", "_a b_1.,+()-.mcap"]) == 0
+    assert run(["record", "start", "--name", "a:b.mcap", "--json"]) == 2
+    shown = capsys.readouterr()
+    assert "servoctl: --name: found 'a:b.mcap'; allowed: a file name of letters, digits, _ and (not " in shown.err
+    assert json.loads(shown.out[shown.out.index("{") :])["error"]["where"] == "--name"
