@@ -14,6 +14,7 @@ from servod.cli.common import JsonOption, example, keep_inputs, print_json
 from servod.cli.groups import export_formats
 from servod.common.errors import AnswerIsNo, BadInput
 from servod.common.files import BadFile
+from servod.common.units import counted
 
 if TYPE_CHECKING:
     from servod.lab.export.export import Exported
@@ -73,7 +74,7 @@ def export(
 
 def _print(done: Exported) -> None:
     unit, trip = done.unit, done.round_trip
-    judged = f"{len(done.judged_on)} recordings" if done.judged_on else "a motion of the model"
+    judged = counted(len(done.judged_on), "recording") if done.judged_on else "a motion of the model"
     print(f"{done.file}: joint {done.joint}, as {done.format}")
     print(f"judged on {judged}, in windows of {done.horizon_s:g} s")
     if trip is None:

@@ -22,6 +22,7 @@ from servod.cli.common import (
 )
 from servod.cli.groups import stored_sets
 from servod.common.errors import BadInput
+from servod.common.units import counted
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -198,7 +199,7 @@ def headline(gains: GainSet) -> list[str]:
     lines = [f"{gains.name}: {_LAWS.get(gains.parameters.law, gains.parameters.law)}"]
     lines += [gains.description] if gains.description else []
     model = f"axis model {source.model_sha256[:12]}" if source.model_sha256 else "no axis model"
-    recordings = f"{len(source.data_sha256)} recordings" if source.data_sha256 else "no recordings"
+    recordings = counted(len(source.data_sha256), "recording") if source.data_sha256 else "no recordings"
     lines.append(f"made by {source.author} on {source.date} with {source.tool}, from {model} and {recordings}")
     if source.cross_checks:
         agree = sum(check.agrees for check in source.cross_checks)

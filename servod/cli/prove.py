@@ -20,6 +20,7 @@ from servod.cli.common import JsonOption, example, need_folder, one_thread, run_
 from servod.cli.groups import engines
 from servod.common.errors import BadInput
 from servod.common.files import BadFile
+from servod.common.units import counted
 
 if TYPE_CHECKING:
     from servod.qualify.blind.conceal import BlindTrial
@@ -145,7 +146,7 @@ def _conceal(out: Path, trial: BlindTrial, sealed: bool) -> None:
             return
         there = replace(trial, sha256=digest)
         write_trial(out, there)
-    sealed_truth = f"the truth of {trial.cases + trial.null} cases"
+    sealed_truth = f"the truth of {counted(trial.cases + trial.null, 'case')}"
     print(f"sealed: SHA-256 {there.sha256} of {sealed_truth}", file=sys.stderr, flush=True)
 
 

@@ -19,6 +19,7 @@ from servod.cli.common import JsonOption, example, need_folder, one_thread, prin
 from servod.cli.groups import scenario_groups
 from servod.common.errors import AnswerIsNo, BadInput
 from servod.common.portable import need_linux
+from servod.common.units import counted
 
 if TYPE_CHECKING:
     from servod.qualify.faults.run import Outcome
@@ -100,6 +101,7 @@ _SOAK_HELP = example(
 )
 _MS_PER_H = 3_600_000
 _FEWEST_H, _MOST_H = 1e-4, 1e5
+_RANGE = f"from {_FEWEST_H:g} to {_MOST_H:g}"
 
 
 def register_soak(app: typer.Typer) -> None:
@@ -112,19 +114,21 @@ def _hours(text: str) -> float:
     with contextlib.suppress(ValueError):
         if _FEWEST_H <= float(text) <= _MOST_H:
             return float(text)
-    raise typer.BadParameter(f"{text} is not a number of hours from {_FEWEST_H:g} to {_MOST_H:g}.")
+    raise typer.BadParameter(f"a number of hours {_RANGE}.")
 
 
 def soak(
     hours: Annotated[
-        float, typer.Option(parser=_hours, metavar="HOURS", help="Axis time in hours, for each job.")
+        float, typer.Option(parser=_hours, metavar="HOURS", help=f"Axis time of each job, in hours {_RANGE}.")
     ] = 0.5,
     seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Of schedule and noise.")] = 1,
     cycles: Annotated[int | None, typer.Option(min=1, help="Cycles of the loop instead of --hours.")] = None,
     wall: Annotated[bool, typer.Option("--wall", help="Real processes on the wall clock.")] = False,
     limit_hours: Annotated[
         float | None,
-        typer.Option("--limit-hours", parser=_hours, metavar="HOURS", help="End after so much wall clock."),
+        typer.Option(
+            "--limit-hours", parser=_hours, metavar="HOURS", help=f"End after so much wall clock, in hours {_RANGE}."
+        ),
     ] = None,
     jobs: Annotated[int, typer.Option(min=1, max=64, help="Independent axes, each with a seed of its own.")] = 1,
     out: Annotated[Path, typer.Option(help="Folder for state, report and the drive's record.")] = Path("out/soak"),
@@ -246,7 +250,7 @@ def faults(
         _report(found, len(chosen), out, as_json)
     failed = [outcome.name for outcome in found if not outcome.passed]
     if failed:
-        raise AnswerIsNo(f"{len(failed)} of {len(found)} scenarios did not pass: {', '.join(failed)}")
+        raise AnswerIsNo(f"{len(failed)} of {counted(len(found), 'scenario')} did not pass: {', '.join(failed)}")
 
 
 def _chosen(files: list[Path] | None, only: str | None, group: str | None, stepped: bool) -> dict[str, Scenario]:
@@ -262,7 +266,7 @@ def _chosen(files: list[Path] | None, only: str | None, group: str | None, stepp
         raise BadInput("--group", group, ", ".join(groups))
     chosen = {name: s for name, s in here.items() if group in (None, s.group) and fnmatchcase(name, only or "*")}
     if not chosen:
-        found = f"{only or 'all'}, which fits none of {len(here)} scenarios"
+        found = f"{only or 'all'}, which fits none of {counted(len(here), 'scenario')}"
         raise BadInput("--only", found, "a pattern that fits a name, as in 'torque_frames*'")
     return chosen
 

@@ -77,9 +77,9 @@ def is_there(path: Path) -> bool:
 
 
 def reason(error: OSError) -> str:
-    """What the system says, to stand in a sentence: "no such device", "permission denied"."""
+    """What the system says, to stand in a sentence: "no such device", "permission denied", but "AF_UNIX path"."""
     text = error.strerror or str(error)
-    return text[:1].lower() + text[1:]
+    return text[:1].lower() + text[1:] if text[1:2].islower() else text
 
 
 def _sentence(where: str | Path, error: Exception, writing: bool) -> str:

@@ -20,6 +20,11 @@ def rad_per_count(counts_per_turn: float) -> float:
     return TWO_PI / counts_per_turn
 
 
+def counted(count: int, noun: str) -> str:
+    """A count with its noun: "1 recording", "2 recordings"."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
 def wrapped_difference(new_counts: int, old_counts: int, measuring_range: int) -> int:
     """Shortest signed way from `old_counts` to `new_counts` on a counter that wraps at `measuring_range`.
 

@@ -173,6 +173,23 @@ class Strict(BaseModel):
 M = TypeVar("M", bound=BaseModel)
 
 
+#: What PyYAML calls a part of the text that stands where none may, in words of the file.
+_TOKENS = {
+    "<scalar>": "a text where none may stand",
+    "<stream end>": "the end of the file, where more must come",
+    "<block mapping start>": "keys that are indented otherwise than those before",
+    "<block sequence start>": "a list that is indented otherwise than what is before",
+    "<block end>": "the end of what is indented",
+    "<document start>": "the start of another document",
+    "<document end>": "the end of the document",
+    "<directive>": "a directive (%)",
+    "<alias>": "an alias (*) where none may stand",
+    "<anchor>": "an anchor (&) where none may stand",
+    "<tag>": "a tag (!) where none may stand",
+    "?": "a key where none may stand",
+}
+
+
 def parse_yaml(text: str, where: str) -> Any:
     """Parse one YAML 1.2 document; raises BadInput naming `where` and the line."""
     if len(text) > _MOST_CHARACTERS:
@@ -183,6 +200,7 @@ def parse_yaml(text: str, where: str) -> Any:
         line = error.problem_mark.line + 1 if error.problem_mark else "?"
         problem = (error.problem or "broken YAML").replace("but got ", "but found ")
         found = problem.rpartition("but found ")[2].removeprefix("found ")
+        found = _TOKENS.get(found.strip("'"), found)
         raise BadInput(f"{where}: line {line}", found, "a YAML 1.2 mapping") from None
     except (yaml.YAMLError, ValueError) as error:
         raise BadInput(where, (str(error).splitlines() or ["broken YAML"])[0], "a YAML 1.2 mapping") from None

@@ -37,7 +37,7 @@ def test_a_scenario_of_ones_own_is_run_told_and_written(mine: Path, capsys: pyte
     assert run(["qualify", "faults", "--scenario", str(mine), "--out", str(out)]) == 0
     shown = capsys.readouterr()
     assert "1 of 1 passed mine" in shown.err
-    assert "1 of 1 scenarios in 1 files passed." in shown.out
+    assert "1 of 1 scenario in 1 file passed." in shown.out
     document = json.loads((out / "faults.json").read_text())
     assert (document["planned"], document["passed"], document["scenarios"][0]["name"]) == (1, 1, "mine")
     page = (out / "report.html").read_text()
@@ -50,7 +50,7 @@ def test_one_that_does_not_pass_is_exit_code_1_and_says_why(mine: Path, capsys: 
     assert run(["qualify", "faults", "--scenario", str(mine), "--json"]) == 1
     shown = capsys.readouterr()
     assert json.loads(shown.out)["scenarios"][0]["complaints"] == ["the axis ended DISABLED, expected ENABLED"]
-    assert shown.err.splitlines()[-1] == "servoctl: 1 of 1 scenarios did not pass: mine"
+    assert shown.err.splitlines()[-1] == "servoctl: 1 of 1 scenario did not pass: mine"
 
 
 @pytest.mark.parametrize(

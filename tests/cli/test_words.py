@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,13 @@ from servod.cli.app import run
 from servod.cli.common import table_console
 from servod.cli.status import screen
 from servod.cli.track import _where, _why
+from servod.common.errors import BadInput
+from servod.common.files import reason
+from servod.common.units import counted
+from servod.common.yaml import parse_yaml
+from servod.lab.recordings.recording import load_recording
+from servod.qualify.blind.conceal import BlindTrial
+from servod.qualify.soak.document import verdict
 from tests.cli.test_status_screen import document
 
 
@@ -90,3 +98,44 @@ def test_only_a_fault_that_stops_is_why_a_motion_ended() -> None:
     nobody = {"lease": {"stopped_by": None}}
     assert _why({"faults": [warning], **nobody}) == "it was stopped or disabled"
     assert _why({"faults": [warning, fault], **nobody}) == "DRIVE_RESET: A node was reset."
+
+
+def test_a_name_in_the_words_of_the_system_keeps_its_capitals() -> None:
+    assert reason(OSError("AF_UNIX path too long")) == "AF_UNIX path too long"
+    assert reason(OSError(errno.ENOENT, "No such file")) == "no such file"
+    assert reason(OSError(errno.EIO, "I/O error")) == "I/O error"
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ('a: "x" y', "a text where none may stand"),
+        ("a:\n  - 1\n b: 2", "keys that are indented otherwise than those before"),
+        ("a: [1,", "the end of the file, where more must come"),
+        ("- a\nb: 1", "a key where none may stand"),
+    ],
+)
+def test_a_broken_file_is_told_in_its_own_words(text: str, says: str) -> None:
+    with pytest.raises(BadInput) as caught:
+        parse_yaml(text, "x.yaml")
+    assert caught.value.found == says
+
+
+def test_a_noun_stands_with_its_count() -> None:
+    assert [counted(n, "recording") for n in (0, 1, 2)] == ["0 recordings", "1 recording", "2 recordings"]
+    assert str(BlindTrial(1, 9, False)) == "1 case of seed 9"
+    document = {"cycles": 2553, "axis_hours": 0.0007, "faults_injected": 1, "wrong": {}, "excused": {}}
+    assert (
+        verdict(document | {"unproven": [], "untold": []})
+        == "Nothing wrong in 2,553 cycles (2.52 s of axis time), 1 fault."
+    )
+
+
+def test_a_recording_that_is_cut_to_nothing_tells_no_none(tmp_path: Path) -> None:
+    file = tmp_path / "run.csv"
+    file.write_text("t_s,torque_nm,position_rad\n" + "".join(f"{0.001 * k:.3f},0,0\n" for k in range(2000)))
+    whole = load_recording(file)
+    for span, says in (((None, 0.0), "0 rows from its start to 0 s"), ((1.999, None), "1 row from 1.999 s to its end")):
+        with pytest.raises(BadInput) as caught:
+            whole.between(*span)
+        assert caught.value.found == says

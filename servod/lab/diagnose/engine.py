@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from time import monotonic
 
+from servod.common.units import counted
 from servod.formats.model.axis_model import AxisModel
 from servod.lab.diagnose.data.intake import load_traces
 from servod.lab.diagnose.judge.conclude import (
@@ -69,7 +70,7 @@ def diagnose(
     seconds = {"intake": monotonic() - begun}
     if not traces:
         return Diagnosis(units(model), tuple(refused), DiagnosisVerdict.CANNOT_TELL, None, seconds | {"windows": 0.0})
-    on_progress(f"{len(traces)} recordings taken in")
+    on_progress(f"{counted(len(traces), 'recording')} taken in")
     deadline = begun + SETTINGS.forward.search_share * time_limit_s
     selector = Selector(Predictor(traces, model), model, deadline, on_progress, completed.unknown)
     selection = _selected(selector, selector.fit_base())

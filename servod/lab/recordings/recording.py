@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servod.common.errors import BadInput
+from servod.common.units import counted
 from servod.formats.model.axis_model import AxisKind, AxisModel
 from servod.formats.model.drive import DriveKind, DriveLaw
 from servod.formats.recording.record import FIELDS
@@ -110,7 +111,11 @@ class Recording:
         first = 0 if from_s is None else int(np.searchsorted(self.t_s, from_s))
         last = len(self) if to_s is None else int(np.searchsorted(self.t_s, to_s))
         if last - first < LEAST_ROWS:
-            found = f"{max(last - first, 0)} rows from {from_s} to {to_s} s"
+            begin, end = (
+                "its start" if from_s is None else f"{from_s:g} s",
+                "its end" if to_s is None else f"{to_s:g} s",
+            )
+            found = f"{counted(max(last - first, 0), 'row')} from {begin} to {end}"
             raise BadInput(f"{self.path}: column t_s", found, f"{self.t_s[0]:g} to {self.t_s[-1]:g} s")
         if last - first == len(self):
             return self

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from servod import __version__
 from servod.common.errors import BadInput
 from servod.common.files import is_there, read_json, write_bytes
+from servod.common.units import counted
 from servod.qualify.blind import engine, listed
 from servod.qualify.blind.axes import CaseAxis, draw_axis
 from servod.qualify.blind.concealed import NO_THERMOMETER, Concealed, Document, Draw
@@ -442,7 +443,7 @@ class BlindTrial:
     def __str__(self) -> str:
         null = f" and {self.null} that conceal nothing" if self.null else ""
         by = "" if self.engine == Engine.OWN else f", moved by {self.engine}"
-        return f"{self.cases} cases of seed {self.seed}{null}" + (", harder" if self.harder else "") + by
+        return f"{counted(self.cases, 'case')} of seed {self.seed}{null}" + (", harder" if self.harder else "") + by
 
 
 def foreign_in(out: Path) -> list[str]:

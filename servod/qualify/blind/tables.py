@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
+from servod.common.units import counted
 from servod.lab.report.figure import PageTable
 from servod.qualify.blind.count import (
     GOALS,
@@ -48,8 +49,8 @@ def sentences(found: Mapping[str, Any]) -> Iterator[str]:
     plant = "an independent plant" if own else "an independent plant and moved by MuJoCo"
     diagnosed = f"servod {found['version']}" + (f", sources {found['sources'][:12]}," if found["sources"] else "")
     yield (
-        f"{found['cases']} cases of seed {found['seed']}{null}{harder}: axes drawn by {plant}, recorded in a "
-        f"closed loop, diagnosed by {diagnosed} from their folders alone. SHA-256 of the truth, told "
+        f"{counted(found['cases'], 'case')} of seed {found['seed']}{null}{harder}: axes drawn by {plant}, recorded in "
+        f"a closed loop, diagnosed by {diagnosed} from their folders alone. SHA-256 of the truth, told "
         f"before: {found['sha256']}."
     )
     if found["times"]["hurried"]:
@@ -112,11 +113,11 @@ def _figure(
 def effects(found: Mapping[str, Any]) -> PageTable:
     """For each effect: named how often, parameters, and as what it was mistaken."""
     rows = []
-    for effect, counted in found["by_effect"].items():
+    for effect, counts in found["by_effect"].items():
         parameters = found["parameters"]["by_effect"].get(effect, {"median_error": None, "covered": None})
         others = {name: n for name, n in found["confusion"][effect].items() if name != effect}
         mistaken = ", ".join(f"{name} {n}" for name, n in sorted(others.items(), key=lambda item: -item[1]))
-        named = f"{counted['right']}/{counted['cases']}"
+        named = f"{counts['right']}/{counts['cases']}"
         rows.append((effect, named, percent(parameters["median_error"]), percent(parameters["covered"]), mistaken))
     header = ("effect", "named", "median error of parameters", "intervals that cover", "beside it or instead")
     return PageTable(EFFECTS, header, tuple(rows))

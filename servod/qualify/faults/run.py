@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from servod.client.processes import socket_folder
 from servod.common.errors import ServodError, Unreachable
 from servod.common.faults import FAULTS
+from servod.common.units import counted
 from servod.formats.stopping import StoppingStatus
 from servod.qualify.faults.actions import InjectionAction, action_of
 from servod.qualify.faults.evidence import Watch
@@ -303,21 +304,21 @@ def text_table(outcomes: Sequence[Outcome]) -> str:
 def summary(outcomes: Sequence[Outcome], planned: int) -> list[str]:
     """The campaign in a few sentences."""
     passed = sum(outcome.passed for outcome in outcomes)
-    lines = [f"{passed} of {len(outcomes)} scenarios in {_files(outcomes)} files passed."]
+    lines = [f"{passed} of {counted(len(outcomes), 'scenario')} in {counted(_files(outcomes), 'file')} passed."]
     if len(outcomes) < planned:
         lines.append(f"{planned - len(outcomes)} of {planned} were not run.")
     for loss, row in worst(outcomes).items():
         if row["scenarios"]:
             lines.append(
-                f"Loss of {loss}: {row['scenarios']} scenarios, the drive had left the controller's command after "
-                f"{milliseconds(row['left_ms'])} ms and the torque was gone after {milliseconds(row['gone_ms'])} ms "
-                "at the latest."
+                f"Loss of {loss}: {counted(int(row['scenarios']), 'scenario')}, the drive had left the controller's "
+                f"command after {milliseconds(row['left_ms'])} ms and the torque was gone after "
+                f"{milliseconds(row['gone_ms'])} ms at the latest."
             )
     lines += [f"Exempt from the bound: {o.name}: {o.exempt}." for o in outcomes if o.exempt is not None]
     recovered, repairs = sum(o.recovered for o in outcomes), sum(o.by_repair for o in outcomes)
     lines.append(f"Recovered: {recovered}; {repairs} need repair at the hardware.")
     lost = lost_records(outcomes)
-    lines.append(f"Cycle records lost: {sum(lost)} in {len(lost)} scenarios with a recorder.")
+    lines.append(f"Cycle records lost: {sum(lost)} in {counted(len(lost), 'scenario')} with a recorder.")
     return lines
 
 
@@ -386,7 +387,7 @@ def write_page(outcomes: Sequence[Outcome], planned: int, path: Path) -> None:
     by_group = sorted(outcomes, key=lambda outcome: (outcome.group, outcome.name))
     for group, members in groupby(by_group, key=lambda outcome: outcome.group):
         rows = sorted(members, key=_worst_first)
-        title = f"{group.capitalize()}: {len(rows)} scenarios"
+        title = f"{group.capitalize()}: {counted(len(rows), 'scenario')}"
         page.heading(title)
         failed = not all(outcome.passed for outcome in rows)
         page.table(PageTable(title, HEADER, tuple(map(cells, rows))), folded=not failed)

@@ -156,9 +156,10 @@ _FAULT_HEADER = (
 
 def verdict(found: dict[str, Any]) -> str:
     """The answer: what was wrong, why it is no pass, and what it does not tell."""
-    amount = (
-        f"{found['cycles']:,} cycles ({found['axis_hours']:.2f} h of axis time), {found['faults_injected']:,} faults"
-    )
+    faults = f"{found['faults_injected']:,} {'fault' if found['faults_injected'] == 1 else 'faults'}"
+    hours = found["axis_hours"]
+    span = f"{hours:.2f} h" if hours >= 0.1 else f"{3600.0 * hours:.3g} s"
+    amount = f"{found['cycles']:,} cycles ({span} of axis time), {faults}"
     wrong = ", ".join(f"{count:,} {kind}" for kind, count in found["wrong"].items())
     said = [f"Wrong in {amount}: {wrong}." if wrong else f"Nothing wrong in {amount}."]
     if found["unproven"]:
