@@ -26,7 +26,7 @@ import typer
 from typer.main import get_command
 
 from servod import __version__
-from servod.cli.common import begin_command, drop_empty_folders, json_is_printed, print_json, say_next
+from servod.cli.common import begin_command, drop_empty_folders, is_stage, json_is_printed, print_json, say_next
 from servod.cli.groups import NEXT, Grouped, modules
 from servod.client.control import Refused
 from servod.common.errors import AnswerIsNo, BadInput, Details, ServodError, Unreachable, details, one_line
@@ -285,7 +285,8 @@ def complain(error: BaseException, arguments: list[str]) -> int:
         print_json({"error": {"code": code, "exit_code": exit_code, "message": message, **known}})
     if code == "internal":
         raise error
-    say(message)
+    if code != "interrupted" or not is_stage():  # the command of a stage is interrupted with it, and says so
+        say(message)
     return exit_code
 
 

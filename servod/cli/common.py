@@ -98,7 +98,7 @@ def suggest(*words: str, why: str = "") -> None:
 
 def say_next(usual: str) -> None:
     """The last line of a command on a terminal; a pipe, a document and a stage of another command get none."""
-    if sys.stdout.isatty() and not _printed and _HANDED_DOWN not in os.environ:
+    if sys.stdout.isatty() and not _printed and not is_stage():
         print(*(_suggested or [f"next: {usual}"]))
 
 
@@ -159,7 +159,7 @@ def _no_folder(option: str, folder: Path, error: OSError) -> BadFile:
 
 def _lock(option: str, folder: Path) -> None:
     """Lock the folder for as long as this command lives. A stage has its command's lock."""
-    if sys.platform == "win32" and _HANDED_DOWN in os.environ:
+    if sys.platform == "win32" and is_stage():
         return  # descriptors are not handed on there; the command that waits for this stage holds the lock
     held = _handed_down(folder)
     try:
@@ -184,6 +184,11 @@ def run_stage(arguments: Sequence[str], *, capture: bool = False) -> tuple[int, 
     out = subprocess.PIPE if capture else None
     done = subprocess.run(command, pass_fds=handed, env=environment, stdout=out, check=False)
     return done.returncode, done.stdout or b""
+
+
+def is_stage() -> bool:
+    """Whether this command is a stage of another one."""
+    return _HANDED_DOWN in os.environ
 
 
 def _handed_down(folder: Path) -> int | None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from servod.cli.app import run
 from servod.qualify.blind.conceal import BlindTrial, foreign_in, write_trial
 from tests.cli.test_output import servoctl
 
@@ -67,3 +68,19 @@ def test_an_own_folder_is_known_by_its_trial_or_by_what_an_interrupted_one_left(
     assert foreign_in(tmp_path) == ["notes.txt"]
     write_trial(tmp_path, BlindTrial(3, 9, harder=True))
     assert foreign_in(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("environment", "said"), [({}, "servoctl: interrupted\n"), ({"SERVOCTL_LOCKED_FOLDERS": ""}, "")]
+)
+def test_an_interrupt_that_comes_to_command_and_stage_is_told_once(
+    environment: dict[str, str], said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(**_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("servod.cli.app.command", lambda: interrupted)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    assert run(["prove", "--out", "x"]) == 130
+    assert capsys.readouterr().err == said
