@@ -194,11 +194,15 @@ def write_atomically(path: Path, text: str) -> None:
 
 def write_bytes(path: Path, content: bytes) -> Path:
     """Replace `path` by `content`, make its folder where it is missing, and return `path`. Raises BadInput."""
+    missing = [folder for folder in path.parents if not is_there(folder)]
     try:
         make_folder(path.parent)
         with replacing(path) as stream:
             stream.write(content)
     except OSError as error:
+        with contextlib.suppress(OSError):
+            for folder in missing:
+                folder.rmdir()
         raise unwritable(path, error) from None
     return path
 

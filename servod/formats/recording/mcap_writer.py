@@ -342,12 +342,17 @@ class McapFile:
         self._close_spool()
 
     def abandon(self) -> int:
-        """Let go of a file that cannot be written any more; returns how many cycles can be read from its path."""
+        """Let go of a file that cannot be written any more; returns how many cycles can be read from its path.
+
+        A file without any goes: of a full disk it would be an empty one.
+        """
         held = 0
         with contextlib.suppress(OSError, ValueError):  # ValueError: it was closed already
             size = os.fstat(self._stream.fileno()).st_size
             ends = [counts for end, counts in self._writer.chunk_ends if end <= size and self._is_there()]
             held = ends[-1].get(self._cycle, 0) if ends else 0
+            if not held and self._is_there():
+                self.path.unlink()
         with contextlib.suppress(OSError):
             self._stream.raw.close()
         with contextlib.suppress(OSError, ValueError):
@@ -359,6 +364,18 @@ class McapFile:
         """Let go of the spool; it has no name, so nothing is left."""
         with contextlib.suppress(OSError):  # a full disk may refuse its last bytes
             self._spool.close()
+
+
+def write_whole(path: Path, rows: Iterable[bytes], offset_ns: int) -> None:
+    """A recording of these cycle records at `path`, where there is none: whole or not at all. Raises OSError."""
+    file = McapFile(path, {}, offset_ns)
+    try:
+        file.write_rows(rows)
+        file.close()
+    except BaseException:
+        file.abandon()
+        path.unlink(missing_ok=True)
+        raise
 
 
 def split_rows(data: bytes | bytearray | memoryview) -> Iterator[bytes]:

@@ -120,7 +120,9 @@ class RunMark:
             aside.replace(self._path)
             flush_folder(self._path.parent)
         except OSError:
-            stream.close()
+            with contextlib.suppress(OSError):  # a full disk refuses the last bytes of it, too
+                aside.unlink()
+                stream.close()
             raise
         return stream
 

@@ -22,7 +22,7 @@ from servod.common.portable import flush_folder
 from servod.common.workers import worker_pool
 from servod.formats.gains.gain_set import load_gains
 from servod.formats.recording.mcap_reader import read_recording
-from servod.formats.recording.mcap_writer import McapFile, split_rows
+from servod.formats.recording.mcap_writer import split_rows, write_whole
 from servod.lab.commission.state import RUNS, digest, write_json
 from servod.lab.commission.state import read_walk_json as read_json
 from servod.lab.commission.walk import OnProgress, Walk
@@ -66,9 +66,7 @@ def save_rows(path: Path, rows: Rows) -> None:
     try:
         make_folder(path.parent)
         aside.unlink(missing_ok=True)
-        file = McapFile(aside, {}, 0)
-        file.write_rows(split_rows(rows.tobytes()))
-        file.close()
+        write_whole(aside, split_rows(rows.tobytes()), 0)
         aside.replace(path)
         flush_folder(path.parent)
     except OSError as error:

@@ -185,6 +185,8 @@ def sole_walk(folder: Path) -> Iterator[None]:
     try:
         yield
     except (BadInput, Unreachable):
+        with contextlib.suppress(OSError):  # not there, or not empty
+            (folder / RECORDINGS).rmdir()
         with contextlib.suppress(OSError):
             if [entry.name for entry in folder.iterdir()] == [STATE]:
                 (folder / STATE).unlink()

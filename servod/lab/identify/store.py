@@ -22,7 +22,7 @@ from servod.common.files import make_folder, read_json, unreadable, unwritable, 
 from servod.common.yaml import Strict, validate
 from servod.formats.model.identified import Devices
 from servod.formats.recording.mcap_reader import read_recording
-from servod.formats.recording.mcap_writer import McapFile, split_rows, wall_offset_ns
+from servod.formats.recording.mcap_writer import split_rows, wall_offset_ns, write_whole
 from servod.lab.identify.trace import ExperimentKind, RecordedMotion
 
 LIST = "experiments.json"
@@ -103,13 +103,15 @@ class Recordings:
         name = f"{len(self._done):02d}_{trace.kind.value}.mcap"
         try:
             self._set_aside()
-            file = McapFile(self.folder / name, {}, self._offset_ns)
-            file.write_rows(split_rows(rows.tobytes()))
-            file.close()
+            write_whole(self.folder / name, split_rows(rows.tobytes()), self._offset_ns)
             sha256 = file_sha256(self.folder / name)
             entry = _Entry(file=name, kind=trace.kind, motion=motion, sha256=sha256, settings=trace.settings)
             self._done.append(entry)
-            self._write_list()
+            try:
+                self._write_list()
+            except OSError:
+                (self.folder / name).unlink()
+                raise
         except OSError as error:
             raise _unwritable(self.folder / name, error) from None
         return replace(trace, sha256=sha256)

@@ -14,14 +14,14 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Lock
 
 from servod.common.errors import BadInput
-from servod.common.files import read_json, write_bytes
+from servod.common.files import read_json, unwritable, write_bytes
 from servod.common.sources import DIAGNOSES, sha256_on_disk
 from servod.qualify.blind.conceal import CASES, lock
 
@@ -89,6 +89,17 @@ class Examiner:
     def _examine(self, name: str) -> None:
         """Diagnose a copy of a case in a folder where there is nothing else, then fetch the answer."""
         answers = self._out / ANSWERS / name
+        try:
+            self._answer(name, answers)
+        except (OSError, BadInput) as error:
+            shutil.rmtree(answers, ignore_errors=True)  # half of it, on a full disk
+            with suppress(OSError):  # others have an answer
+                answers.parent.rmdir()
+            if isinstance(error, OSError):
+                raise unwritable(error.filename or answers, error) from None
+            raise
+
+    def _answer(self, name: str, answers: Path) -> None:
         answers.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(prefix="servod-case-") as alone, (answers / SAID).open("wb") as said:
             case, answer = Path(alone) / "case", Path(alone) / "answer"
@@ -99,7 +110,8 @@ class Examiner:
             run = self._spend([sys.executable, "-m", "servod.cli", *arguments, limit], case, said.fileno())
             if run is not None:
                 _unchanged(sha256_on_disk(DIAGNOSES), self._sources)
-                shutil.copytree(answer, answers, dirs_exist_ok=True)
+                if answer.is_dir():  # a diagnosis that was refused leaves none
+                    shutil.copytree(answer, answers, dirs_exist_ok=True)
                 write_bytes(answers / RUN, (json.dumps(asdict(run)) + "\n").encode())
 
     def _spend(self, command: Sequence[str], where: Path, said: int) -> DiagnosisRun | None:
