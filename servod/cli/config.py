@@ -189,7 +189,9 @@ def _check_axis(file: Path) -> dict[str, Any]:
             with named_in(f"{file}: {device}.eds"):
                 _check_eds(Path(eds))
     with named_in(f"{file}: gains.initial"):
-        require_fit(load_gains(config.gains.initial), config, str(config.gains.initial))
+        initial = load_gains(config.gains.initial)
+    with named_in(f"{file}: gains"):
+        require_fit(initial, config, str(config.gains.initial))
     with named_in(f"{file}: model"):
         with_expected(config)
     notes += [*_open_wires(config), *brake_notes(config)]

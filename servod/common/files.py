@@ -12,7 +12,7 @@ import json
 import os
 import stat
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -63,10 +63,10 @@ def unwritable(where: str | Path, error: Exception) -> BadFile:
 
 @contextlib.contextmanager
 def named_in(where: str) -> Iterator[None]:
-    """A file that cannot be had in the block is told with the place that names it: "axis.yaml: gains.initial"."""
+    """What is wrong with a file in the block is told with the place that names it: "axis.yaml: gains.initial"."""
     try:
         yield
-    except BadFile as error:
+    except BadInput as error:
         error.where, error.args = f"{where}: {error.where}", (f"{one_line(where)}: {error}",)
         raise
 
@@ -200,11 +200,16 @@ def write_bytes(path: Path, content: bytes) -> Path:
         with replacing(path) as stream:
             stream.write(content)
     except OSError as error:
-        with contextlib.suppress(OSError):
-            for folder in missing:
-                folder.rmdir()
+        _remove_empty(missing)
         raise unwritable(path, error) from None
     return path
+
+
+def _remove_empty(folders: Sequence[Path]) -> None:
+    """Take folders away, the deepest first, as far as they are there and empty."""
+    for folder in folders:
+        with contextlib.suppress(OSError):
+            folder.rmdir()
 
 
 def write_file(path: Path, text: str) -> None:
@@ -217,11 +222,13 @@ def write_file(path: Path, text: str) -> None:
 
 def refusal_of(folder: Path) -> str:
     """Why no file can be written in a folder, which is made where it is missing; empty where one can."""
+    missing = [one for one in (folder, *folder.parents) if not is_there(one)]
     try:
         make_folder(folder)
         with tempfile.TemporaryFile(dir=folder) as file:
             file.write(b"servod")
     except OSError as error:
+        _remove_empty(missing)
         return f"{folder}: no file can be written there ({reason(error)})"
     return ""
 

@@ -133,7 +133,7 @@ _DECAYS_LAGS = 1.2
 
 #: What is said where nothing is known of the joint.
 UNKNOWN = (
-    "stopping: not reckoned: neither `model`, stopping.least_inertia, wiring_proof.inertia nor the gain set's design "
+    "stopping: not computed: neither `model`, stopping.least_inertia, wiring_proof.inertia nor the gain set's design "
     "tells of the joint; nothing keeps its stopping distance inside the limits"
 )
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from servod.common.errors import BadInput
-from servod.common.files import write_bytes
+from servod.common.files import refusal_of, write_bytes
 from servod.formats.recording.mcap_writer import write_whole
 from servod.formats.recording.run_mark import RunMark
 from servod.lab.commission.comparison import save_rows
@@ -62,14 +62,21 @@ def test_a_full_disk_keeps_nothing(name: str, step: int, tmp_path: Path, monkeyp
 
 
 def test_a_diagnosis_that_finds_the_disk_full_names_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / CASES / "c000").mkdir(parents=True)
+    case = tmp_path / CASES / "c000"
+    case.mkdir(parents=True)
+    (case / "model.yaml").touch()
 
-    def full(_self: Examiner, _name: str, answers: Path) -> None:
-        answers.mkdir(parents=True)
-        (answers / "said.txt").touch()
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(answers / "said.txt"))
+    def full(_descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(Examiner, "_answer", full)
-    with pytest.raises(BadInput, match=r"answers/c000/said\.txt: cannot be written: the disk is full"):
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(BadInput, match=r"case/model\.yaml: cannot be written: the disk is full"):
         Examiner(tmp_path, 5.0).run(1, lambda _name, _done, _of: None)
     assert [entry.name for entry in tmp_path.iterdir()] == [CASES]
+
+
+def test_folders_above_one_that_cannot_be_made_are_taken_away(tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match="the name is too long"):
+        write_bytes(tmp_path / "new" / (300 * "n") / "file", b"")
+    assert "name too long" in refusal_of(tmp_path / "new" / (300 * "n"))
+    assert not list(tmp_path.iterdir())

@@ -171,6 +171,8 @@ def test_saved_log_lines_tell_it_too(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert [(f["code"], f["after_s"]) for f in first["faults"]] == [("TORQUE_CLIPPED", -0.25), ("BUS_OFF", 0.0)]
     assert (later["code"], later["detail"]) == ("RECORDER_FAILED", "full")
     assert len(told(["--journal", str(journal), "--last", "1"], capsys)["incidents"]) == 1
+    journal.write_text("-- No entries --\n")
+    assert told(["--journal", str(journal)], capsys)["incidents"] == []
     journal.write_text("# A page\n\nof something else, in which nobody logs.\n")
     assert run(["faults", "--journal", str(journal)]) == 2
     assert "no line with a date" in capsys.readouterr().err

@@ -100,7 +100,7 @@ def test_enable_move_and_disable(servoctl: Servoctl) -> None:
     assert servoctl.state == "DISABLED"
     told = servoctl("enable")
     assert told.startswith("enabled\n")
-    assert ("\nwarning: stopping: not reckoned" in told) is (servoctl.json("status")["stopping"] is None) is True
+    assert ("\nwarning: stopping: not computed" in told) is (servoctl.json("status")["stopping"] is None) is True
     told = servoctl("track", "sine", "--amplitude", "0.02", "--frequency", "2", "--duration", "0.5").splitlines()
     assert re.fullmatch(r"motion done: RMS error \S+ mrad, peak error \S+ mrad", told[0])
     assert re.match(r"settling time \d\.\d{3} s after the reference had come to rest, to 0\.8 mrad \(2 % of", told[1])

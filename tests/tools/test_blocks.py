@@ -90,4 +90,4 @@ def test_the_check_of_the_first_configuration_prints_what_the_page_shows(tmp_pat
     assert first.endswith("servoctl config check out/axis/axis.yaml\n")
     shown = page.read_text().partition(f"{first}```\n\n```\n")[2].partition("\n```")[0]
     pattern = ".*".join(re.escape(part) for part in shown.split("…"))
-    assert "not reckoned" in shown and re.fullmatch(f"{pattern}\n", blocks.run(first, tmp_path, 60.0))
+    assert "not computed" in shown and re.fullmatch(f"{pattern}\n", blocks.run(first, tmp_path, 60.0))

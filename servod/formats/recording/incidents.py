@@ -28,6 +28,8 @@ _NEVER_NS = 2**63
 _ENABLING = 1  # servod.runtime.loop.axis_state.AxisState, which stands above
 _FILE = re.compile(r"(?P<axis>.+)-fault-(?P<stamp>\d{8}-\d{6})-\w+?(-\d+)?\.mcap")
 _LINE = re.compile(r"\bfault (?P<code>[A-Z_]+) \((?P<reaction>[A-Z_]+)\): (?P<text>.*)")
+#: What journalctl says of itself: "-- No entries --", "-- Boot … --".
+_REMARK = "-- "
 #: How journalctl (short-iso, short-iso-precise) and the daemon itself write when a line came.
 _STAMP = re.compile(r"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d)(?:[.,](\d{1,6}))?([+-]\d\d:?\d\d|Z)?")
 
@@ -188,7 +190,7 @@ def marks(folder: Path, axis: str | None = None) -> list[Path]:
 def of_journal(path: Path) -> list[Incident]:
     """Incidents in the daemon's log lines, as `journalctl -o short-iso` or the daemon writes them. Raises BadInput."""
     found: list[Seen] = []
-    lines = read_text(path).splitlines()
+    lines = [line for line in read_text(path).splitlines() if not line.startswith(_REMARK)]
     if any(map(str.strip, lines)) and not any(_STAMP.search(line) or _LINE.search(line) for line in lines):
         raise BadInput(str(path), "no line with a date", "lines of `journalctl -o short-iso` of the unit")
     for line in lines:

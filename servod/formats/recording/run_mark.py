@@ -120,9 +120,9 @@ class RunMark:
             aside.replace(self._path)
             flush_folder(self._path.parent)
         except OSError:
-            with contextlib.suppress(OSError):  # a full disk refuses the last bytes of it, too
-                aside.unlink()
-                stream.close()
+            for give_up in (aside.unlink, stream.close):
+                with contextlib.suppress(OSError):  # a full disk refuses the last bytes of it, too
+                    give_up()
             raise
         return stream
 

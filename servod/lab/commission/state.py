@@ -18,7 +18,7 @@ from pydantic import Field
 
 from servod.common import files
 from servod.common.errors import BadInput, Unreachable
-from servod.common.files import read_json, write_bytes, write_file
+from servod.common.files import is_there, read_json, unwritable, write_bytes, write_file
 from servod.common.portable import lock_folder
 from servod.common.yaml import Strict, validate
 
@@ -176,19 +176,22 @@ class State:
 def sole_walk(folder: Path) -> Iterator[None]:
     """Nobody else works in the folder meanwhile; the lock ends with the process. Raises Unreachable.
 
-    A walk that was refused before it wrote anything leaves nothing: a state alone is of no step.
+    A walk that was refused before it wrote anything leaves nothing: where there was no state, one alone is of no step.
     """
     try:
         lock = lock_folder(folder)
-    except OSError:
-        raise Unreachable(f"--out {folder}: another servoctl commission is at work there") from None
+    except OSError as error:
+        if not folder.is_dir():
+            raise unwritable(f"--out {folder}", error) from None
+        raise Unreachable(f"--out {folder}: another command is at work there") from None
+    begun = is_there(folder / STATE)
     try:
         yield
     except (BadInput, Unreachable):
         with contextlib.suppress(OSError):  # not there, or not empty
             (folder / RECORDINGS).rmdir()
         with contextlib.suppress(OSError):
-            if [entry.name for entry in folder.iterdir()] == [STATE]:
+            if not begun and [entry.name for entry in folder.iterdir()] == [STATE]:
                 (folder / STATE).unlink()
         raise
     finally:

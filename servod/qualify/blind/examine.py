@@ -21,7 +21,7 @@ from tempfile import TemporaryDirectory
 from threading import Lock
 
 from servod.common.errors import BadInput
-from servod.common.files import read_json, unwritable, write_bytes
+from servod.common.files import read_bytes, read_json, unwritable, write_bytes
 from servod.common.sources import DIAGNOSES, sha256_on_disk
 from servod.qualify.blind.conceal import CASES, lock
 
@@ -103,7 +103,7 @@ class Examiner:
         answers.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(prefix="servod-case-") as alone, (answers / SAID).open("wb") as said:
             case, answer = Path(alone) / "case", Path(alone) / "answer"
-            shutil.copytree(self._out / CASES / name, case)
+            _copy(self._out / CASES / name, case)
             recordings = sorted(str(path) for path in case.glob("*.csv.gz"))
             arguments = ["diagnose", "--model", str(case / MODEL), *recordings, "--out", str(answer)]
             limit = f"--time-limit={self._time_limit_s:g}"
@@ -111,7 +111,7 @@ class Examiner:
             if run is not None:
                 _unchanged(sha256_on_disk(DIAGNOSES), self._sources)
                 if answer.is_dir():  # a diagnosis that was refused leaves none
-                    shutil.copytree(answer, answers, dirs_exist_ok=True)
+                    _copy(answer, answers)
                 write_bytes(answers / RUN, (json.dumps(asdict(run)) + "\n").encode())
 
     def _spend(self, command: Sequence[str], where: Path, said: int) -> DiagnosisRun | None:
@@ -131,6 +131,12 @@ class Examiner:
         cpu_s = used.ru_utime + used.ru_stime
         wall_s, memory_mib = time.monotonic() - begun, used.ru_maxrss / 1024.0
         return DiagnosisRun(process.returncode, wall_s, cpu_s, memory_mib, self._time_limit_s, self._sources)
+
+
+def _copy(folder: Path, target: Path) -> None:
+    """Copy the files of a folder, and of those in it, into another. Raises BadInput, which names the file."""
+    for file in sorted(path for path in folder.rglob("*") if path.is_file()):
+        write_bytes(target / file.relative_to(folder), read_bytes(file))
 
 
 def one_diagnosis(out: Path, names: Sequence[str], sources: str | None = None) -> str | None:

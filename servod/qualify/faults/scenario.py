@@ -140,7 +140,7 @@ class Expectation(Strict):
     torque_gone_ms: float | None = Field(None, gt=0.0, description="the joint feels no torque from then on")
     refused: str | None = Field(None, description="words of the message with which the bring-up or command is refused")
     says: FindingWord | None = Field(
-        None, description="name of servod.runtime.loop.wiring.findings.Finding: what the wiring test tells"
+        None, description="name of servod.runtime.loop.wiring.findings.WiringOutcome: what the wiring test tells"
     )
     lost_records: int = Field(0, ge=0, description="cycle records that may be missing")
     drive_error: int | None = Field(None, gt=0, le=0xFFFF, description="the error code that the user is shown")

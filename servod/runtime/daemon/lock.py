@@ -27,13 +27,16 @@ RUNTIME_FOLDER = Path("/run/servod")
 _OPEN = os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
 _RIGHTS = 0o660
 _PID_BYTES = 20
+#: Commands that may come and go, and take the file away with them, between its opening and its lock.
+_TRIES = 100
 
 
 class _Lock:
     """Locks of one process; `release`, the end of a `with` block or of the process gives them back.
 
-    The files stay, and are made again by `keep` where somebody else took one away. Those of a command that comes and
-    goes are taken away by itself while it still holds them, where there was none before.
+    The files stay, and `keep` makes one again that somebody else took away. Those of a command that comes and goes are
+    taken away by itself while it still holds them, where there was none before; their folders stay, for others may have
+    come to rely on them.
     """
 
     def __init__(self, *wanted: tuple[str, Path], passing: bool = False) -> None:
@@ -42,10 +45,11 @@ class _Lock:
         Raises Unreachable, with who stands in the way, when one cannot be had.
         """
         self._files: dict[tuple[str, Path], int] = {}
-        self._made: dict[Path, list[Path]] = {}  # file -> what was not there of it and its folders
+        self._made = set[Path]()
         try:
             for what, path in wanted:
-                self._made[path] = [one for one in (path, *path.parents) if passing and not os.path.lexists(one)]
+                if passing and not os.path.lexists(path):
+                    self._made.add(path)
                 self._files[what, path] = _taken(what, path)
         except Unreachable:
             self.release()
@@ -68,8 +72,9 @@ class _Lock:
         """Give the locks back."""
         while self._files:
             (_, path), file = self._files.popitem()
-            if _is_at(path, file):
-                _take_away(self._made[path])
+            if path in self._made and _is_at(path, file):
+                with contextlib.suppress(OSError):
+                    path.unlink()
             os.close(file)
 
 
@@ -88,20 +93,15 @@ class BusLock(_Lock):
         super().__init__(_of_bus(bus), passing=True)
 
 
-def _take_away(made: list[Path]) -> None:
-    """A file, and the folders above it that are empty now."""
-    with contextlib.suppress(OSError):
-        for path in made:
-            path.rmdir() if path.is_dir() else path.unlink()
-
-
 def _taken(what: str, path: Path) -> int:
     """The file, locked for this process. Raises Unreachable."""
-    while True:
+    for _ in range(_TRIES):
         file = _locked(what, path)
         if _is_at(path, file):
             break
         os.close(file)  # who had it until now has taken the file away
+    else:
+        raise Unreachable(f"{what}: its lock {path} is taken away again and again")
     with contextlib.suppress(OSError):  # a full disk: it is ours all the same, only nobody can tell whose
         os.pwrite(file, f"{os.getpid()}\n".ljust(_PID_BYTES).encode(), 0)
     return file
@@ -168,8 +168,7 @@ def _open(path: Path) -> int:
         return os.open(path, _OPEN)
     except FileNotFoundError:
         pass
-    if not path.parent.is_dir():
-        path.parent.mkdir(parents=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
     file = os.open(path, _OPEN | os.O_CREAT, _RIGHTS)
     os.fchmod(file, _RIGHTS)  # whatever the umask left of them
     if os.geteuid() == 0:

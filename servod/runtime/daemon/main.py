@@ -60,7 +60,9 @@ def check(path: Path) -> AxisConfig:
     for note in check_names(config, str(path)):
         log.warning("%s", note)
     with named_in(f"{path}: gains.initial"):
-        require_fit(load_gains(config.gains.initial), config, str(config.gains.initial))
+        initial = load_gains(config.gains.initial)
+    with named_in(f"{path}: gains"):
+        require_fit(initial, config, str(config.gains.initial))
     if config.model is not None:
         with named_in(f"{path}: model"):
             load_axis_model(config.model)

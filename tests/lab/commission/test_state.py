@@ -207,6 +207,21 @@ def test_a_walk_that_is_refused_leaves_nothing(tmp_path: Path) -> None:
     assert [entry.name for entry in foreign.iterdir()] == ["one.txt"]
 
 
+def test_a_refusal_keeps_the_state_that_was_there(tmp_path: Path) -> None:
+    """It may be of another axis, or cut short: whose it is, its engineer decides."""
+    state = tmp_path / "state.json"
+    for text in ('{"axis":', json.dumps({"axis": {"another": 1}, "steps": {}})):
+        state.write_text(text)
+        with pytest.raises(BadInput):
+            run(walk(tmp_path), (Copy("one", None, []),))
+        assert state.read_text() == text
+
+
+def test_a_folder_that_is_gone_is_no_other_command(tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match="no such folder"), sole_walk(tmp_path / "gone"):
+        pass
+
+
 def test_a_kill_between_file_and_state_only_repeats_the_step(tmp_path: Path) -> None:
     runs: list[str] = []
     run(walk(tmp_path), chain(runs))

@@ -129,7 +129,7 @@ def add_pair(selector: Selector, selection: Selection, candidates: Sequence[Cand
 
     Where one of them does so without the other, which only led there, it comes in alone.
     """
-    if not _much_left(selector, selection):
+    if selection.terms + 2 > SETTINGS.forward.most_terms or not much_left(selector, selection):
         return selection
     for first in candidates[:FIRSTS]:
         if monotonic() > selector.deadline:
@@ -137,6 +137,8 @@ def add_pair(selector: Selector, selection: Selection, candidates: Sequence[Cand
         begun = selector.settle_candidate(first, selection.fit.mismatch)
         seconds, tried = selector.candidates(begun, skip=frozenset(selection.rejected) | {first.effect})
         selection = replace(selection, tried=selection.tried + tried)
+        if monotonic() > selector.deadline:
+            break
         pair = _pair(selector, selection, begun, seconds)
         longer = selection if pair is None else _entered(selector, selection, pair, (first, seconds))
         if longer.terms > selection.terms:
@@ -196,7 +198,7 @@ def _entry(term: Candidate, tried: Sequence[Candidate]) -> TermEntry:
     return TermEntry(left, tuple(candidate for candidate in tried if candidate.effect != term.effect))
 
 
-def _much_left(selector: Selector, selection: Selection) -> bool:
+def much_left(selector: Selector, selection: Selection) -> bool:
     """Whether more is left than forms and noise make, of what can be explained and of dry friction."""
     left = selector.error(selection.fit.mismatch) - selection.floor
     explainable = above_noise(selection.base_error, selection.floor)

@@ -17,13 +17,12 @@ from numpy.typing import NDArray
 from servod.lab.diagnose.effects import effect, names
 from servod.lab.diagnose.effects.hypothesis import Hypothesis
 from servod.lab.diagnose.effects.search_context import SearchContext
-from servod.lab.diagnose.predict.floor import above_noise
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.select.candidates import Candidate
 from servod.lab.diagnose.select.cross_validation import make_folds, predict_held_out
 from servod.lab.diagnose.select.fit import Fit
 from servod.lab.diagnose.select.free_windows import free_run_errors
-from servod.lab.diagnose.select.joint import add_levels, add_pair
+from servod.lab.diagnose.select.joint import add_levels, add_pair, much_left
 from servod.lab.diagnose.select.levels import is_another, level_at_bound
 from servod.lab.diagnose.select.merit import Merit
 from servod.lab.diagnose.select.selection import Selection, TermEntry
@@ -251,12 +250,7 @@ PUT_BACK = (
 
 def above_floor(selector: Selector, selection: Selection) -> bool:
     """Whether terms came in, and what they left is more than forms and noise make."""
-    if not selection.terms:
-        return False
-    left = selector.error(selection.fit.mismatch) - selection.floor
-    explainable = above_noise(selection.base_error, selection.floor)
-    torque = math.sqrt(max(left, 0.0))
-    return left > SETTINGS.group.left_share * explainable and torque > SETTINGS.group.much_left * selector.predictor.dry
+    return bool(selection.terms) and much_left(selector, selection)
 
 
 def add_group(selector: Selector, selection: Selection) -> Selection:

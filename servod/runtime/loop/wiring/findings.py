@@ -40,7 +40,7 @@ class WiringOutcome(IntEnum):
 class WiringReport(NamedTuple):
     """One test as the loop reports it, in joint coordinates; NaN where nothing was measured."""
 
-    finding: int  # servod.runtime.loop.wiring.findings.Finding
+    finding: int  # servod.runtime.loop.wiring.findings.WiringOutcome
     found: float  # what the failed check saw, in its own unit
     lowest: float  # and what it allows
     highest: float
