@@ -14,7 +14,6 @@ import typer
 from servod.cli.common import (
     DEFAULT_SOCKET,
     JsonOption,
-    OnProgress,
     SocketOption,
     example,
     need_folder,
@@ -26,6 +25,7 @@ from servod.cli.common import (
 )
 from servod.cli.groups import walk_steps
 from servod.common.errors import BadInput
+from servod.common.progress import OnProgress
 
 if TYPE_CHECKING:
     from servod.client.open import WalkAxis

@@ -13,7 +13,7 @@ import stat
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -23,6 +23,7 @@ import typer
 from servod.common.errors import BadInput, Unreachable
 from servod.common.files import BadFile, reason, unwritable
 from servod.common.portable import lock_again, lock_folder
+from servod.common.progress import OnProgress
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -252,10 +253,6 @@ def report(result: dict[str, Any], done: str, as_json: bool) -> None:
 
 # --- Progress --------------------------------------------------------------------------------------------------------
 # One progress bar over a whole command, on standard error, so that standard output stays what was asked for.
-
-
-#: Told what is being done, and the share of the whole that is done.
-OnProgress = Callable[[str, float], None]
 
 
 @contextmanager

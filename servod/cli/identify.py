@@ -28,9 +28,9 @@ from servod.common.files import write_file
 
 if TYPE_CHECKING:
     from servod.client.axis import AxisClient
+    from servod.common.progress import OnProgress
     from servod.formats.model.axis_model import AxisModel
     from servod.lab.identify.analysis import Analysis
-    from servod.lab.identify.walk import OnProgress
 
     Job = Callable[["_Walk", OnProgress], Analysis]
 

@@ -173,7 +173,7 @@ class GainStore:
                 write_atomically(self._history_file, "\n".join(lines[-_KEPT_LINES:]) + "\n")
 
     def mend(self) -> None:
-        """Write what says which set is active again where it is damaged, has no copy or an old one, or is of an earlier
+        """Rewrite the record of the active set where it is damaged, has no copy or an old one, or is of an earlier
         version."""
         with self._locked(), contextlib.suppress(BadInput, OSError):  # nothing to mend it with, or a full disk: later
             state = self._active()

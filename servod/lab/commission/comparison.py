@@ -19,13 +19,14 @@ from servod.client.open import VirtualWalkAxis
 from servod.common.errors import AnswerIsNo, BadInput
 from servod.common.files import make_folder, replacing, unreadable, unwritable
 from servod.common.portable import flush_folder
+from servod.common.progress import OnProgress
 from servod.common.workers import worker_pool
 from servod.formats.gains.gain_set import load_gains
 from servod.formats.recording.mcap_reader import read_recording
 from servod.formats.recording.mcap_writer import split_rows, write_whole
 from servod.lab.commission.state import RUNS, digest, write_json
 from servod.lab.commission.state import read_walk_json as read_json
-from servod.lab.commission.walk import OnProgress, Walk
+from servod.lab.commission.walk import Walk
 from servod.lab.recordings.recording import Rows, rows_of
 from servod.lab.tracking.metrics import Curves
 from servod.lab.tracking.stepped import measure

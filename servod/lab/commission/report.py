@@ -13,6 +13,7 @@ from typing import Any
 
 from servod import __version__
 from servod.client.open import VirtualWalkAxis
+from servod.common.progress import OnProgress
 from servod.formats.gains.gain_set import CertificateCheck, GainSet, load_gains
 from servod.formats.model.axis_model import AxisModel, load_axis_model
 from servod.kernels.laws import LABELS
@@ -40,7 +41,7 @@ from servod.lab.commission.state import (
     write_json,
 )
 from servod.lab.commission.state import read_walk_json as read_json
-from servod.lab.commission.walk import OnProgress, StepFailed, Walk
+from servod.lab.commission.walk import StepFailed, Walk
 from servod.lab.identify import store
 from servod.lab.identify.analysis import analyse
 from servod.lab.report.figure import Figure, PageTable

@@ -16,6 +16,7 @@ from typing import Any, Protocol
 
 from servod.client.open import WalkAxis
 from servod.common.errors import AnswerIsNo, BadInput
+from servod.common.progress import OnProgress
 from servod.lab.commission.state import State, file_sha256, sole_walk
 
 # --- Questions to a person -------------------------------------------------------------------------------------------
@@ -49,8 +50,6 @@ class Questions:
         return self.yes or (self.person() and self.put(offer))
 
 
-#: Told what a step does, and the share of it that is done.
-OnProgress = Callable[[str, float], None]
 #: Opens the progress of one step, by its title.
 Progress = Callable[[str], AbstractContextManager[OnProgress]]
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from servod.client.axis import AxisClient, ReferenceMotion
 from servod.common.errors import AnswerIsNo, BadInput, ServodError
+from servod.common.progress import OnProgress
 from servod.formats.config import AxisConfig
 from servod.formats.gains.design import Design
 from servod.formats.gains.gain_set import GainSet, Promise, require_certificate, require_same_loop
@@ -20,9 +21,6 @@ from servod.lab.deploy.judge import doubtful_timing, every_cycle, limits_met, mo
 from servod.lab.deploy.outcome import Baseline, Deployment, Ending
 from servod.lab.recordings.recording import Rows, rows_of
 from servod.lab.verify.validation import STEP_S, Figures, ValidationMotion, motion_for
-
-#: Told what is done, and the share of the whole that is.
-OnProgress = Callable[[str, float], None]
 
 #: How a trial ended, by whether the set ran already and whether it proved itself.
 _ENDINGS = {

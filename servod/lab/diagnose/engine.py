@@ -7,9 +7,10 @@ terms, a drift, nominal values restored, cross-validation), what is selected is 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from time import monotonic
 
+from servod.common.progress import OnLine
 from servod.common.units import counted
 from servod.formats.model.axis_model import AxisModel
 from servod.lab.diagnose.data.intake import load_traces
@@ -43,14 +44,12 @@ from servod.lab.diagnose.select.stepwise import (
 from servod.lab.diagnose.settings import SETTINGS
 from servod.lab.recordings import Recording
 
-OnProgress = Callable[[str], None]
-
 
 def diagnose(
     model: AxisModel,
     recordings: Sequence[Recording],
     time_limit_s: float = 120.0,
-    on_progress: OnProgress | None = None,
+    on_progress: OnLine | None = None,
     held_out: Sequence[Recording] = (),
 ) -> Diagnosis:
     """What `model` leaves out of the axis that the recordings are of.

@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 
 from servod.client.axis import AxisClient
 from servod.common.errors import ServodError
+from servod.common.progress import OnProgress
 from servod.formats.config import AxisConfig
 from servod.formats.model.identified import Devices
 from servod.lab.identify import store
@@ -28,9 +28,6 @@ from servod.lab.identify.fits import kick as kick_fit
 from servod.lab.identify.fits import presliding as presliding_fit
 from servod.lab.identify.fits import response as response_fit
 from servod.lab.identify.trace import ExperimentKind, RecordedMotion
-
-#: Told at every step: what is being done, and the share of the walk that is done.
-OnProgress = Callable[[str, float], None]
 
 #: Ramps and bursts of presliding, in pairs of both directions.
 PAIRS = 5

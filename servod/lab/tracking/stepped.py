@@ -13,6 +13,7 @@ from functools import partial
 from servod.client.axis import AxisClient, AxisDropped, ReferenceMotion
 from servod.client.stepped import SteppedAxis
 from servod.common.errors import AnswerIsNo
+from servod.common.progress import OnShare
 from servod.formats.gains.gain_set import GainSet
 from servod.lab.recordings.recording import moving, rows_of
 from servod.lab.tracking.metrics import (
@@ -27,13 +28,10 @@ from servod.lab.tracking.metrics import (
     tracking,
 )
 
-#: Told how much of a measurement is done, from 0 to 1.
-OnProgress = Callable[[float], None]
-
 _LOOK_S = 0.5
 
 
-def measure(open_axis: Callable[[], SteppedAxis], gains: GainSet, on_progress: OnProgress | None = None) -> Tracking:
+def measure(open_axis: Callable[[], SteppedAxis], gains: GainSet, on_progress: OnShare | None = None) -> Tracking:
     """Activate `gains` on a new axis, track (19) for 30 s, then steps of 100 and 10 mrad, each held for 20 s.
 
     The axis may be enabled or not, its controller is replaced. Raises AnswerIsNo when the axis refuses or drops out.
@@ -90,7 +88,7 @@ def activate(axis: AxisClient, gains: GainSet) -> None:
 def run_motion(
     axis: SteppedAxis,
     motion: ReferenceMotion,
-    on_progress: OnProgress | None = None,
+    on_progress: OnShare | None = None,
     name: str = "the gain set",
     swing: Swing | None = None,
 ) -> Curves:

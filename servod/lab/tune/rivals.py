@@ -7,19 +7,18 @@ some of its numbers fixed, so that more freedom is never worse.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import replace
 
 from servod.common.portable import usable_cores
+from servod.common.progress import OnProgress
 from servod.common.workers import worker_pool
 from servod.formats.model.axis_model import AxisModel
 from servod.lab.tune.laws import RIVALS
 from servod.lab.tune.plan import BUDGET, Feedback, Tuned, TuningSettings
 from servod.lab.tune.tuning import Values, tune
 
-#: Told what has just been tuned ("pd_dob, equal feedback"), and how much of everything is done, from 0 to 1.
-OnProgress = Callable[[str, float], None]
 Key = tuple[Feedback, str]
 
 _POLL_S = 0.05

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from servod import __version__
+from servod.common.progress import OnShare
 from servod.formats.gains.gain_set import GainSet, Provenance
 from servod.formats.gains.parameters import Parameters
 from servod.formats.model.axis_model import AxisModel
@@ -253,8 +254,6 @@ def _descend(counted: _Counted, start: Array) -> None:
         return
 
 
-#: Told how much of a tuning is done, from 0 to 1.
-OnProgress = Callable[[float], None]
 #: The numbers of a set that was tuned, by the names of their ranges.
 Values = dict[str, float]
 
@@ -265,7 +264,7 @@ def tune(
     feedback: Feedback,
     plan: TuningSettings,
     starts: Sequence[Values] = (),
-    on_progress: OnProgress | None = None,
+    on_progress: OnShare | None = None,
 ) -> Tuned:
     """Tune the rival `name` (a key of servod.lab.tune.laws.RIVALS) in one class; the same arguments give the same set.
 

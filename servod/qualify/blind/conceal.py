@@ -12,7 +12,7 @@ import io
 import json
 import re
 import secrets
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from servod import __version__
 from servod.common.errors import BadInput
 from servod.common.files import is_there, read_json, write_bytes
+from servod.common.progress import OnCount
 from servod.common.units import counted
 from servod.qualify.blind import engine, listed
 from servod.qualify.blind.axes import CaseAxis, draw_axis
@@ -324,13 +325,10 @@ def _truth(
     }
 
 
-#: Told how many cases are made of how many.
-OnProgress = Callable[[int, int], None]
-
 CASES, SEALED, TRUTH, HOLDOUT = "cases", "sealed", "truth.json", "holdout"
 
 
-def conceal(plans: Sequence[CaseSpec], settings: Settings, out: Path, on_progress: OnProgress) -> str:
+def conceal(plans: Sequence[CaseSpec], settings: Settings, out: Path, on_progress: OnCount) -> str:
     """Write folders into `out`/cases and the truth into `out`/sealed; returns the truth's SHA-256."""
     truths = {}
     for number, plan in enumerate(plans):
@@ -346,7 +344,7 @@ def conceal(plans: Sequence[CaseSpec], settings: Settings, out: Path, on_progres
     return hashlib.sha256(content).hexdigest()
 
 
-def open_cases(plans: Sequence[CaseSpec], settings: Settings, out: Path, on_progress: OnProgress) -> None:
+def open_cases(plans: Sequence[CaseSpec], settings: Settings, out: Path, on_progress: OnCount) -> None:
     """Write folders with everything in them, truth.yaml as well, for whoever develops a diagnosis."""
     for number, plan in enumerate(plans):
         case = make_case(plan, settings)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import io
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from servod.common.errors import BadInput
 from servod.common.files import write_bytes
+from servod.common.progress import OnCount
 from servod.lab.report.figure import Colour, Figure, PageTable, PlotAxis, PlotPanel, Style, curve
 from servod.lab.report.page import Page, Verdict, table_html
 from servod.lab.report.pictures import write_pictures
@@ -135,13 +136,10 @@ def calibration(found: Mapping[str, Any]) -> Drawn:
     return Drawn(Figure("calibration", "Is a stated confidence to be believed?", (panel,), caption=caption), CONFIDENCE)
 
 
-#: Told how many cases are scored of how many.
-OnProgress = Callable[[int, int], None]
-
 PICTURES = "pictures"
 
 
-def score(trial: BlindTrial, out: Path, on_progress: OnProgress) -> dict[str, Any]:
+def score(trial: BlindTrial, out: Path, on_progress: OnCount) -> dict[str, Any]:
     """Open the seal of the trial in `out` and score all answers.
 
     Raises BadInput when it is not what was sealed, or when not all answers are of one diagnosis.

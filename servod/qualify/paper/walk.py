@@ -15,6 +15,7 @@ from types import TracebackType
 from typing import Any, ParamSpec, TypeVar
 
 from servod.common.portable import usable_cores
+from servod.common.progress import OnProgress
 from servod.common.workers import worker_pool
 from servod.formats.gains.gain_set import GainSet
 from servod.lab.report.figure import Figure
@@ -35,8 +36,6 @@ from servod.qualify.paper.results import Results, Row
 P = ParamSpec("P")
 T = TypeVar("T")
 
-#: Told what was finished last, and the share of all work that is done.
-OnProgress = Callable[[str, float], None]
 
 MOST_WORKERS = 4
 _POLL_S = 0.05

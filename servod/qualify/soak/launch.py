@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 from servod.client.processes import sigterm_as_interrupt, socket_folder
 from servod.common.errors import ServodError, Unreachable
 from servod.common.files import reason, write_bytes
+from servod.common.progress import OnProgress
 from servod.qualify.soak.document import Course, added, document, write_page
 from servod.qualify.soak.kinds import KINDS
 from servod.qualify.soak.memory import Growth, Memory
@@ -29,8 +30,6 @@ from servod.qualify.soak.wall_clock import WallSoak, of_the_wall
 # Runs a soak: episode after episode until the amount, the time or the person says enough; the state goes to disk.
 
 
-#: Told one line on how it goes, and the share that is done.
-OnProgress = Callable[[str, float], None]
 DOCUMENT_NAME = "soak.json"
 _SAVE_S = 10.0
 #: Between two looks at memory [s of axis time]; a look hands back what is not used, which takes a tenth of a second.

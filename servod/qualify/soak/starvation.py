@@ -104,7 +104,7 @@ class Starvation:
         self._piece_ns.clear()
         self._causes = dict(processes)
 
-    def hungry(self, processes: Processes) -> bool:
+    def is_starved(self, processes: Processes) -> bool:
         """Whether one of them waited for long in the piece that goes on."""
         self._take(processes)
         return max(self._piece_ns.values(), default=0) > _STARVED_NS

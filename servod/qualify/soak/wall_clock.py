@@ -243,23 +243,23 @@ class WallSoak:
 
         Returns whether the first try did it.
         """
-        hungry, why = False, ""
+        starved, why = False, ""
         for attempt in range(_TRIES):
-            hungry = hungry or self._starvation.hungry(self._watched())
+            starved = starved or self._starvation.is_starved(self._watched())
             if recovery is Recovery.RESTART or attempt == _TRIES - 1:
                 self._end_session(_ENDS_AFTER_LOSS)
                 self.tally.restarts += 1
                 self._axis.machine.start_daemon()
             if self._enabled(recovery is not Recovery.NONE or attempt > 0):
-                self._report_tries(recovery, attempt, hungry, why)
+                self._report_tries(recovery, attempt, starved, why)
                 return attempt == 0
             why = why or self._axis.refusal or self._faults()
         self.findings.add(Wrong.NOT_RECOVERED, self._axis.now_ns(), f"by {recovery}: {self._axis.refusal}")
         raise AnswerIsNo(f"episode {self.findings.episode}: the axis cannot be enabled any more")
 
-    def _report_tries(self, recovery: Recovery, attempt: int, hungry: bool, why: str) -> None:
+    def _report_tries(self, recovery: Recovery, attempt: int, starved: bool, why: str) -> None:
         """More than one try is a finding, unless the processes were starved; then it is counted."""
-        if attempt and hungry:
+        if attempt and starved:
             self.tally.excused["recovered by another try"] += 1
         elif attempt:
             text = f"not by {recovery}, but at try {attempt + 1} of {_TRIES}: {why}"

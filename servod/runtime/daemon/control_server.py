@@ -119,7 +119,7 @@ class Lease:
             raise Unreachable(f"{started}; wait for its end, or stop, halt or disable the axis")
 
 
-# --- Places ----------------------------------------------------------------------------------------------------------
+# --- Connections -----------------------------------------------------------------------------------------------------
 # Who has a place at the control socket, and who gives way when all are taken. Whoever wants to stop the axis shall find
 # a place, however many idle clients there are: no process has more than its share, and of a full house leaves who is
 # idle, else one of the most crowded process. The one who commands stays; who commanded a moment ago, or stopped the

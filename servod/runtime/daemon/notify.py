@@ -37,7 +37,7 @@ class Notifier:
         own = f"\nWATCHDOG_USEC={self.watchdog_ns // 1000}\nWATCHDOG=1" if self.watchdog_ns else ""
         self._send(f"READY=1\nSTATUS={_one_line(status)}{own}")
 
-    def begins_anew(self, status: str, within_s: float) -> None:
+    def restarts(self, status: str, within_s: float) -> None:
         """Nobody feeds the watchdog until the next `ready`, which comes `within_s`."""
         patience = f"\nWATCHDOG_USEC={int(within_s * 1e6)}\nWATCHDOG=1" if self.watchdog_ns else ""
         self._send(f"STATUS={_one_line(status)}{patience}")

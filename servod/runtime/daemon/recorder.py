@@ -68,7 +68,7 @@ class RecordingFiles:
             return self._unused(f"{self._axis_name}-{_now()}")
         path = (self._directory / name.replace("\0", "/")).resolve()  # a zero byte is in no name of a file
         if path.parent != self._directory.resolve() or not _FILE_NAME.fullmatch(path.name):
-            allowed = "a file name of letters, digits, _ and (not first) spaces . , + ( ) - that ends in .mcap, in"
+            allowed = "a file name that ends in .mcap, of letters, digits, _ and, not first, spaces and . , + ( ) -, in"
             raise BadInput("record_start: path", repr(name), f"{allowed} {self._directory}")
         if self._like_own.match(path.name):
             # It would count as one of those that make room, and push the seconds before a real fault out.

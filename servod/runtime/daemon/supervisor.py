@@ -63,7 +63,7 @@ _SILENT_S = 4 * SDO_TIMEOUT_S
 _LEAVE_S = 0.5
 #: The longest that the manager's watchdog waits from there to the first round of the next supervisor: both nodes are
 #: reset and brought up by some two hundred SDO transfers.
-_ANEW_S = 60.0
+_RESTART_S = 60.0
 _STATUS_NS = NS_PER_S
 _TEXTFILE_NS = 5 * NS_PER_S
 _STAYS_POWERED = FAULTS[FaultCode.DRIVE_STAYS_POWERED].bit
@@ -339,7 +339,7 @@ class Supervisor:
         """Bus and nodes are back, the drive shows no power. The loop ends, in order where its own connection lives."""
         self._why_ends = "servod begins again, for bus and nodes are back; connect again"
         log.warning(STARTS_AGAIN)
-        self._notifier.begins_anew(STARTS_AGAIN, _ANEW_S)
+        self._notifier.restarts(STARTS_AGAIN, _RESTART_S)
         self._recorder.add_event("node", "bus and nodes are back: the axis begins again, disabled")
         exit_code = self._loop.stop(_LEAVE_S)
         self._take_records(time.monotonic_ns())

@@ -1,7 +1,7 @@
 """Waits for bus and nodes: at the start until they are there, after their loss until the axis may begin again.
 
 Around the loop, for a daemon that runs with `--wait`, as the service does. Whether they are there is looked at by reads
-alone on a connection of its own (servod.runtime.fieldbus.master, `Master.look`). Beginning again ends DISABLED: it is a
+alone on a connection of its own (servod.runtime.fieldbus.master, `Master.look`). A restart ends DISABLED: it is a
 new bring-up, as after a restart of the daemon, and enables nothing; what else was wrong before it stays latched.
 """
 

@@ -23,7 +23,7 @@ _ASKED_TURNS, _MOST_CREDIT = 2.0, 3.0
 _TURN_SHARE = 0.25
 _OF_LATE_S = 0.2
 #: A step starts all afresh, but no sooner than this after the last that did; else it is a turn of the reference.
-_ANEW_S = 1.0
+_STEP_EVERY_S = 1.0
 #: Torque that is injected on purpose makes the law swing too: from this share of the least range on, and this long.
 _INJECTED_SHARE, _INJECTED_S = 0.1, 0.2
 #: Turns between which the reference has gone on so far [rad, m] are those of a load over the position: a weight that
@@ -65,7 +65,7 @@ class Oscillation:
         """Nothing was counted: at an enable and a change of the law; the reference is at `position`, and the torque
         limit at rest is `limit_nm`, as the way to rest may have narrowed it."""
         self._swing_nm = limit_nm if self._configured_nm is None else self._configured_nm
-        self._since_anew_s, self._injected, self._velocity = math.inf, 0.0, 0.0
+        self._since_step_s, self._injected, self._velocity = math.inf, 0.0, 0.0
         self._forget(position)
 
     def _forget(self, position: float) -> None:
@@ -85,15 +85,15 @@ class Oscillation:
                 self._velocity = velocity
             elif injected_nm == 0.0:
                 self._injected = 0.0
-        self._since_anew_s += dt_s
+        self._since_step_s += dt_s
         level = self._level
         forgotten = _FORGOTTEN_PER_S * dt_s
         level = max(0.0, level - forgotten) if level > 0.0 else min(0.0, level + forgotten)
         jumps = velocity == self._velocity == 0.0 and abs(position - self._position) > _LEAST_JUMP
         if jumps:
-            again = self._since_anew_s >= _ANEW_S
-            level = (min(level, 0.0) if again else level) - _ASKED_TURNS
-            self._since_anew_s = 0.0 if again else self._since_anew_s
+            afresh = self._since_step_s >= _STEP_EVERY_S
+            level = (min(level, 0.0) if afresh else level) - _ASKED_TURNS
+            self._since_step_s = 0.0 if afresh else self._since_step_s
         elif self._asked(velocity, dt_s):
             level -= _ASKED_TURNS
         self._position, self._velocity = position, velocity

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from servod.client.open import VirtualWalkAxis
+from servod.common.progress import OnProgress
 from servod.lab.commission import report
 from servod.lab.commission.state import (
     AFTER_ROWS,
@@ -27,7 +28,7 @@ from servod.lab.commission.state import (
     file_sha256,
 )
 from servod.lab.commission.steps import STEPS, rivals, validate
-from servod.lab.commission.walk import OnProgress, Questions, Step, Walk, WalkOptions, run
+from servod.lab.commission.walk import Questions, Step, Walk, WalkOptions, run
 from tests.lab.synthesize.designs import table1
 
 AXIS = VirtualWalkAxis(table1(), seed=1)

@@ -14,8 +14,9 @@ import pytest
 
 from servod.client.open import VirtualWalkAxis
 from servod.common.errors import AnswerIsNo, BadInput, Unreachable
+from servod.common.progress import OnProgress
 from servod.lab.commission.state import State, sole_walk, write_text
-from servod.lab.commission.walk import OnProgress, Questions, Walk, WalkOptions, run
+from servod.lab.commission.walk import Questions, Walk, WalkOptions, run
 from tests.lab.synthesize.designs import table1
 
 AXIS = VirtualWalkAxis(table1(), seed=1)

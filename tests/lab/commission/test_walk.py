@@ -16,6 +16,7 @@ import pytest
 
 from servod.client.open import VirtualWalkAxis
 from servod.common.errors import AnswerIsNo
+from servod.common.progress import OnProgress
 from servod.formats.gains.gain_set import GainSet, load_gains
 from servod.formats.model.axis_model import axis_model_yaml
 from servod.lab.commission import walk
@@ -39,7 +40,7 @@ from servod.lab.commission.steps import STEPS as ALL_STEPS
 from servod.lab.commission.steps.deploy import Deploy
 from servod.lab.commission.steps.synthesize import NO_DESIGN, Synthesize, Verify, agreed, relaxed, report_clashes
 from servod.lab.commission.steps.validate import document as comparison
-from servod.lab.commission.walk import OnProgress, Outlook, Questions, Step, StepFailed, Walk, WalkOptions, run
+from servod.lab.commission.walk import Outlook, Questions, Step, StepFailed, Walk, WalkOptions, run
 from servod.lab.deploy.deployment import motion_notice
 from servod.lab.report.figure import Figure, PageTable
 from servod.lab.synthesize.deployed import Wishes

@@ -234,7 +234,7 @@ def test_short_waits_of_many_processes_starve_none(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr("servod.qualify.soak.starvation.stolen_ns", lambda: 0)
     starvation, watched = Starvation(0), {1: STARVED_CYCLE, 2: STARVED_CYCLE, 3: STARVED_SUPERVISOR}
     waited_ms.update({1: 20, 2: 20, 3: 20})
-    assert starvation.waited_ms(watched) == 60.0 and not starvation.hungry(watched)
+    assert starvation.waited_ms(watched) == 60.0 and not starvation.is_starved(watched)
     starvation.look(watched, 10)
     waited_ms[3] += 26  # a piece of its own: only what the supervisor's waiting may cause
     starvation.look(watched, 20)

@@ -34,7 +34,7 @@ class StoppedAxis:
 
 
 @pytest.mark.parametrize(
-    ("recovery", "tries", "hungry", "found"),
+    ("recovery", "tries", "starved", "found"),
     [
         (Recovery.NONE, 0, False, ""),
         (Recovery.NONE, 1, False, "not by none, but at try 2 of 3: FOLLOWING_ERROR"),
@@ -45,16 +45,16 @@ class StoppedAxis:
     ],
 )
 def test_another_try_is_found(
-    monkeypatch: pytest.MonkeyPatch, recovery: Recovery, tries: int, hungry: bool, found: str
+    monkeypatch: pytest.MonkeyPatch, recovery: Recovery, tries: int, starved: bool, found: str
 ) -> None:
     soak = WallSoak.__new__(WallSoak)  # its processes are not asked here
     soak.findings, soak.tally = Findings(), Tally()
     for name, value in (("_axis", StoppedAxis(tries)), ("_settle", lambda: None), ("_watched", dict)):
         monkeypatch.setattr(soak, name, value, raising=False)
-    starvation = type("Hungry", (), {"hungry": lambda _self, _processes: hungry})()
+    starvation = type("Starving", (), {"is_starved": lambda _self, _processes: starved})()
     monkeypatch.setattr(soak, "_starvation", starvation, raising=False)
     first = (recovery is Recovery.NONE and tries == 0) or (recovery is not Recovery.NONE and tries == 1)
     assert soak._recover(recovery) is first
     assert [finding.text for finding in soak.findings.anomalies] == [found] * bool(found)
     assert set(soak.findings.counts) == ({Wrong.NOT_RECOVERED} if found else set())
-    assert soak.tally.excused.total() == (hungry and not first)
+    assert soak.tally.excused.total() == (starved and not first)

@@ -33,7 +33,7 @@ def test_messages_are_what_systemd_reads(manager: socket.socket) -> None:
 
 def test_who_begins_anew_has_the_watchdogs_patience_until_it_is_ready_again(manager: socket.socket) -> None:
     notifier = Notifier({"NOTIFY_SOCKET": manager.getsockname(), "WATCHDOG_USEC": "2000000"})
-    notifier.begins_anew("bus and nodes are back", 60.0)
+    notifier.restarts("bus and nodes are back", 60.0)
     notifier.ready("the axis is disabled")
     assert [manager.recv(200) for _ in range(2)] == [
         b"STATUS=bus and nodes are back\nWATCHDOG_USEC=60000000\nWATCHDOG=1",

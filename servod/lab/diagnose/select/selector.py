@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from servod.common.progress import OnLine
 from servod.formats.model.axis_model import AxisModel
 from servod.lab.diagnose.effects import effect, fitted_elsewhere, unexcited_effects
 from servod.lab.diagnose.effects.base import base_unknowns, document_of
@@ -29,7 +30,6 @@ from servod.lab.diagnose.select.selection import Selection
 from servod.lab.diagnose.settings import SETTINGS
 
 Array = NDArray[np.float64]
-OnProgress = Callable[[str], None]
 
 #: What every geared servo has, first of all.
 SERVO = ("delay", "goal_rate", "load_dependent_friction")
@@ -53,7 +53,7 @@ class Selector:
         predictor: Predictor,
         nominal: AxisModel,
         deadline: float,
-        on_progress: OnProgress,
+        on_progress: OnLine,
         unknown: frozenset[str] = frozenset(),
     ) -> None:
         self.predictor, self.deadline, self.on_progress = predictor, deadline, on_progress

@@ -19,6 +19,7 @@ from servod.client.axis import AxisClient, ReferenceMotion
 from servod.client.processes import socket_folder
 from servod.common.errors import AnswerIsNo, BadInput
 from servod.common.files import write_bytes
+from servod.common.progress import OnProgress
 from servod.formats.gains.design import Uncertainty
 from servod.formats.gains.gain_set import GainSet
 from servod.formats.model.axis_model import AxisModel, axis_model_yaml, load_axis_model
@@ -45,9 +46,6 @@ from servod.lab.synthesize.regions import narrowed
 from servod.lab.tracking.metrics import REST_S, Array, score
 from servod.lab.verify.certify import verify
 from servod.lab.verify.checks import LEAST_PLANTS
-
-#: Told what is done, and the share of the whole that is.
-OnProgress = Callable[[str, float], None]
 
 #: Opens an enabled axis: joint, gain set, folder, seed of its noise.
 OpenAxis = Callable[[AxisModel, GainSet, Path, int], AbstractContextManager[AxisClient]]

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 _KIB = 1024
 _CLIENT_S = 20.0
 #: From the loss to the new bring-up, on the slowest machine (the guest); how often one looks meanwhile.
-_ANEW_S, _LOOK_S = 90.0, 0.1
+_RESTART_S, _LOOK_S = 90.0, 0.1
 _HELD_UP_S = 0.5
 
 
@@ -100,7 +100,7 @@ class VirtualAxisBack(ProcessAction):
         return 1
 
 
-class BeginsAnew(ProcessAction):
+class AwaitRestart(ProcessAction):
     """Bus and nodes are back: the daemon brings the axis up again by itself, DISABLED, and was in FAULT until then.
 
     It may do so before anybody looks: nodes are back before their start has told so. That it did, the log says.
@@ -112,7 +112,7 @@ class BeginsAnew(ProcessAction):
         """Watch it until its fault is gone, without a command."""
         axis.leave()
         states: list[str] = []
-        deadline = time.monotonic() + _ANEW_S
+        deadline = time.monotonic() + _RESTART_S
         while time.monotonic() < deadline:
             with contextlib.suppress(ServodError), axis.machine.client() as client:
                 status = client.call(Verb.STATUS)
@@ -273,7 +273,7 @@ def _moves(axis: ProcessAxis) -> bool:
 PROCESS_ACTIONS: dict[str, type[InjectionAction]] = {
     "signal": Signal,
     "virtual_axis_back": VirtualAxisBack,
-    "begins_anew": BeginsAnew,
+    "begins_anew": AwaitRestart,
     "restart_daemon": RestartDaemon,
     "second_daemon": SecondDaemon,
     "ask": Ask,
