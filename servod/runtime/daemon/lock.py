@@ -48,9 +48,9 @@ class _Lock:
         self._made = set[Path]()
         try:
             for what, path in wanted:
-                if passing and not os.path.lexists(path):
+                self._files[what, path], made = _taken(what, path)
+                if passing and made:
                     self._made.add(path)
-                self._files[what, path] = _taken(what, path)
         except Unreachable:
             self.release()
             raise
@@ -65,7 +65,7 @@ class _Lock:
         """Make the files again that somebody removed, before another takes them. Raises Unreachable: one has."""
         for (what, path), file in self._files.items():
             if not _is_at(path, file):
-                self._files[what, path] = _taken(what, path)
+                self._files[what, path], _ = _taken(what, path)
                 os.close(file)
 
     def release(self) -> None:
@@ -93,10 +93,10 @@ class BusLock(_Lock):
         super().__init__(_of_bus(bus), passing=True)
 
 
-def _taken(what: str, path: Path) -> int:
-    """The file, locked for this process. Raises Unreachable."""
+def _taken(what: str, path: Path) -> tuple[int, bool]:
+    """The file, locked for this process, and whether it was made for that. Raises Unreachable."""
     for _ in range(_TRIES):
-        file = _locked(what, path)
+        file, made = _locked(what, path)
         if _is_at(path, file):
             break
         os.close(file)  # who had it until now has taken the file away
@@ -104,13 +104,13 @@ def _taken(what: str, path: Path) -> int:
         raise Unreachable(f"{what}: its lock {path} is taken away again and again")
     with contextlib.suppress(OSError):  # a full disk: it is ours all the same, only nobody can tell whose
         os.pwrite(file, f"{os.getpid()}\n".ljust(_PID_BYTES).encode(), 0)
-    return file
+    return file, made
 
 
-def _locked(what: str, path: Path) -> int:
-    """A file that stood at `path`, locked for this process. Raises Unreachable."""
+def _locked(what: str, path: Path) -> tuple[int, bool]:
+    """A file that stood at `path`, locked for this process, and whether it was made. Raises Unreachable."""
     try:
-        file = _open(path)
+        file, made = _open(path)
     except OSError as error:
         owner = f", which belongs to user {_owner(path)}" if os.path.lexists(path) else ""
         raise Unreachable(f"{what}: its lock {path}{owner}, cannot be opened ({reason(error)})") from None
@@ -120,7 +120,7 @@ def _locked(what: str, path: Path) -> int:
         holder = os.pread(file, _PID_BYTES, 0).decode(errors="replace").strip() or "unknown"
         os.close(file)
         raise Unreachable(f"{what}: another servod (process {holder}) owns it") from None
-    return file
+    return file, made
 
 
 def _is_at(path: Path, file: int) -> bool:
@@ -162,19 +162,20 @@ def _runtime_folder(what: str, name: str, shared: bool) -> Path:
     )
 
 
-def _open(path: Path) -> int:
-    """The file, made when it is missing: for the folder's owner when root makes it, who is not to lock him out."""
-    try:
-        return os.open(path, _OPEN)
-    except FileNotFoundError:
-        pass
+def _open(path: Path) -> tuple[int, bool]:
+    """The file, and whether it was made: for the folder's owner when root makes it, who is not to lock him out."""
+    with contextlib.suppress(FileNotFoundError):
+        return os.open(path, _OPEN), False
     path.parent.mkdir(parents=True, exist_ok=True)
-    file = os.open(path, _OPEN | os.O_CREAT, _RIGHTS)
+    try:
+        file = os.open(path, _OPEN | os.O_CREAT | os.O_EXCL, _RIGHTS)
+    except FileExistsError:  # another has made it meanwhile, and may have taken it away again
+        return _open(path)
     os.fchmod(file, _RIGHTS)  # whatever the umask left of them
     if os.geteuid() == 0:
         folder = path.parent.stat()
         os.fchown(file, folder.st_uid, folder.st_gid)
-    return file
+    return file, True
 
 
 def _owner(path: Path) -> str:

@@ -82,14 +82,15 @@ def test_a_lock_on_a_file_that_was_taken_away_meanwhile_is_none(
     bus = BusConfig(channel=str(tmp_path / "bus"))
     other, opened = BusLock(bus), lock._open
 
-    def late(path: Path) -> int:
-        file = opened(path)
+    def late(path: Path) -> tuple[int, bool]:
+        file, made = opened(path)
         other.release()
-        return file
+        return file, made
 
     monkeypatch.setattr(lock, "_open", late)
     with BusLock(bus), pytest.raises(Unreachable, match="owns it"):
         BusLock(bus)
+    assert not (tmp_path / "bus.lock").exists(), "whoever made the file at last takes it away"
 
 
 def test_nobody_outside_the_group_may_open_a_lock(runtime: Path) -> None:
@@ -180,7 +181,7 @@ attempt()
 
 
 def test_files_that_may_not_be_opened_are_told_with_their_owner_in_one_line(runtime: Path) -> None:
-    os.close(lock._taken(*lock._of_bus(CAN)))  # as a daemon leaves it
+    os.close(lock._taken(*lock._of_bus(CAN))[0])  # as a daemon leaves it
     (file,) = runtime.glob("*.lock")
     if os.geteuid() != 0:  # nobody to change to: a file that not even its owner may open
         file.chmod(0)
