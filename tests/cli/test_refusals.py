@@ -144,5 +144,8 @@ def test_a_name_of_a_recording_that_is_refused_is_told_by_its_option(
     assert run(["record", "start", "--name", "_a b_1.,+()-.mcap"]) == 0
     assert run(["record", "start", "--name", "a:b.mcap", "--json"]) == 2
     shown = capsys.readouterr()
-    assert "servoctl: --name: found 'a:b.mcap'; allowed: a file name of letters, digits, _ and (not " in shown.err
+    assert (
+        "servoctl: --name: found 'a:b.mcap'; allowed: a file name that ends in .mcap, of letters, digits, _ and"
+        in shown.err
+    )
     assert json.loads(shown.out[shown.out.index("{") :])["error"]["where"] == "--name"
