@@ -22,6 +22,7 @@ from hypothesis import strategies as st
 from servod.cli.app import run
 from servod.client.axis import AxisDropped, ReferenceMotion
 from servod.client.open import daemon_axis, stepped_axis
+from servod.common.errors import Unreachable
 from servod.common.faults import FaultCode
 from servod.common.shipped import shipped
 from servod.common.yaml import validate
@@ -159,7 +160,7 @@ def test_the_daemon_tells_by_fault_status_metrics_and_command(
             axis.run(ReferenceMotion.sine(0.01, 6.0, 5.0))
         except AxisDropped as dropped:
             if FaultCode.DEADLINE_LATE.name in str(dropped):
-                raise TimeoutError("cycles came late, and a law whose cycles do so swings") from dropped
+                raise Unreachable("DEADLINE_LATE: a law whose cycles come late swings") from dropped
             raise
         socket = ["--socket", str(tmp_path / "axis.sock")]
         assert axis.status().enabled
