@@ -290,7 +290,7 @@ def test_a_joint_that_is_as_it_was_is_not_told_of_any_more(certified: GainSet) -
     changed, sound = (Motion(0.02, 3.0, friction=f).records(certified, 12.0) for f in (1.6, 1.0))
     later = [r._replace(cycle=r.cycle + len(changed), time_ns=r.time_ns + 12_000_000_000) for r in sound]
     watch, told = watched(certified, changed)
-    assert told and [row["told"] for row in watch.status()["joint"]] == [True, False, False]
+    assert told and [row["told"] for row in watch.status()["joint"]] == [False, True, True]
     watch.see(later)
     assert [row["told"] for row in watch.status()["joint"]] == [False, False, False]
 
