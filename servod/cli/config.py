@@ -111,8 +111,8 @@ def _check_or_tell(file: Path, refused: list[BadInput]) -> dict[str, Any]:
         return {**_check(file), "error": None}
     except BadInput as error:
         refused.append(error)
-        told = {"message": str(error), **details(error)._asdict()}
-        return {"kind": None, "note": "", "warnings": [], "error": told}
+        mistake = {"message": str(error), **details(error)._asdict()}
+        return {"kind": None, "note": "", "warnings": [], "error": mistake}
 
 
 def _print_checked(found: list[dict[str, Any]]) -> None:

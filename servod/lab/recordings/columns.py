@@ -97,11 +97,6 @@ class ColumnSource(Strict):
             raise ValueError("one of from and from_name")
         return self
 
-    @property
-    def in_words(self) -> str:
-        """The source in words."""
-        return self.source if self.source is not None else f"{self.from_name}... in the file's name"
-
     def require_unit(self, canonical: str, where: str) -> None:
         """See that the unit is one of this canonical column's. Raises BadInput; `where` is the map's file."""
         key = f"{where}: columns.{canonical}"

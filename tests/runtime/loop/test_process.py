@@ -55,7 +55,8 @@ import atexit, os, sys
 from servod.runtime.loop import process
 
 class Cycle:
-    shut_down, let_go = (lambda *_: None), (lambda *_: None)
+    shut_down = lambda *_: None
+    let_go = lambda *_: print("let_go")
 
 def run(cycle, clock):
     print(os.sched_getscheduler(0) == os.SCHED_FIFO)
@@ -71,6 +72,8 @@ process.LoopPlan = type("Plan", (), {"from_json": lambda _: process.LoopPlan, "c
 process.Channel = type("Channel", (), {"__init__": lambda *_: None, "publish_ready": lambda *_: None})
 process.open_bus = process.supervisor_watch = lambda *_: None
 process.Cycle, process.run = (lambda *_: Cycle()), run
+if "unready" in sys.argv:
+    process.Channel.publish_ready = refused
 if "refused" in sys.argv:
     os.sched_setscheduler = refused
 process.main()
@@ -82,11 +85,18 @@ def test_a_loop_whose_cycles_end_in_an_error_lets_others_run(more: tuple[str, ..
     """At its end it is no real-time process any more, and the error is what is told, not that this was refused."""
     command = [sys.executable, "-c", BROKEN, "0", str(os.getpid()), *more]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-    during, after = done.stdout.split()
-    assert after == "False"
+    during, drive, after = done.stdout.split()
+    assert (drive, after) == ("let_go", "False")
     assert during == "False" or not more
     assert done.stderr.rstrip().endswith("RuntimeError: a cycle that ends in an error")
     assert "PermissionError" not in done.stderr
+
+
+def test_a_loop_that_fails_before_its_first_cycle_takes_the_drive_off_torque() -> None:
+    command = [sys.executable, "-c", BROKEN, "0", str(os.getpid()), "unready"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.stdout.split() == ["let_go", "False"]
+    assert done.stderr.rstrip().endswith("PermissionError")
 
 
 #: In place of the loop: ready half a second after its start.
