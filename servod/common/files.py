@@ -11,7 +11,6 @@ import errno
 import json
 import os
 import stat
-import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -222,6 +221,8 @@ def write_file(path: Path, text: str) -> None:
 
 def refusal_of(folder: Path) -> str:
     """Why no file can be written in a folder, which is made where it is missing; empty where one can."""
+    import tempfile  # 2 ms of every start, for a daemon alone
+
     missing = [one for one in (folder, *folder.parents) if not is_there(one)]
     try:
         make_folder(folder)
