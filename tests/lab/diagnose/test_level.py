@@ -11,8 +11,10 @@ from servod.lab.diagnose.effects.base import base_unknowns, document_of
 from servod.lab.diagnose.effects.hypothesis import Document, Hypothesis
 from servod.lab.diagnose.effects.search_context import SearchContext
 from servod.lab.diagnose.predict.predict import Predictor
+from servod.lab.diagnose.select.candidates import Candidate
 from servod.lab.diagnose.select.fit import Fit
 from servod.lab.diagnose.select.levels import is_level_change, level_at_bound
+from servod.lab.diagnose.select.stepwise import worth_trying
 from tests.lab.diagnose.axes import believed, record
 
 
@@ -82,3 +84,21 @@ def test_a_level_that_is_released_is_known_no_more(scene: SearchContext) -> None
     base = Hypothesis(scene.document, base_unknowns(believed()))
     released = base.with_term(next(t for t in effect("inertia").terms(scene) if t.opens))
     assert np.isinf(next(u for u in released.unknowns if u.key == "inertia").spread)
+
+
+def beside(present: Fit, scene: SearchContext, name: str, left: float) -> Candidate:
+    """The first form of an effect that has no numbers to go wrong, beside a fit, and what it is said to leave."""
+    hypothesis = present.hypothesis.with_term(effect(name).terms(scene)[0])
+    at = hypothesis.beside(present.coordinates)
+    return Candidate(name, Fit(hypothesis, at, np.zeros(0), 0.0, np.zeros((0, len(at))), True), left)
+
+
+@pytest.mark.parametrize(("factor", "tried"), [(5.0, ["cogging", "torque_offset"]), (1.0, ["cogging"])])
+def test_what_releases_a_level_on_its_bound_is_tried_however_little_it_takes(
+    scene: SearchContext, factor: float, tried: list[str]
+) -> None:
+    """Beside a weight that takes up what it can of an offset, one step towards the offset takes next to nothing."""
+    present = fit_with("torque_offset", factor)
+    left = {"cogging": 0.87, "asymmetry": 0.92, "torque_offset": 0.93, "delay": 0.95}
+    candidates = [beside(present, scene, name, share) for name, share in left.items()]
+    assert [candidate.effect for candidate in worth_trying(present, candidates)] == tried

@@ -28,13 +28,14 @@ def _columns(scene: SearchContext) -> Columns:
 
 
 def terms(scene: SearchContext) -> list[Term]:
-    """One and two periods in a turn, and a searched order."""
+    """One and two periods in a turn, and a searched order, also with its second harmonic: a disc off its axis and oval."""
     effect, size = "encoder_eccentricity", 1e-3 * scene.reach
     most = 0.1 * scene.reach
-    found = []
-    for peak in scene.peaks(_columns(scene), 2):
-        bound = min(most, 0.4 / peak.n)
-        found.append(sine_term(effect, scene, peak, size, scene.length, most=bound))
+    peaks = scene.peaks(_columns(scene), 2)
+    found = [
+        sine_term(effect, scene, peak, size, scene.length, most=min(most, 0.4 / peak.n), multiples=multiples)
+        for peak, multiples in [*((peak, 1) for peak in peaks), (peaks[0], 2)]
+    ]
     low = [] if scene.linear else scene.low_orders(1.0, 2.0)
     fixed = [sine_term(effect, scene, Peak(n, 0.0, 0.0, 0.0), size, scene.length, most=most, free=False) for n in low]
     return fixed + found

@@ -9,19 +9,22 @@ from servod.lab.diagnose.effects.looks import Look
 from servod.lab.diagnose.effects.search_context import SearchContext
 from servod.lab.diagnose.effects.two_mass import two_mass_term
 
-#: Resonances to start from, as multiples of the observer's bandwidth, and shares of the load.
-RESONANCES, SHARES = (0.3, 0.7, 1.4, 2.8, 6.0), (0.3, 0.65)
+#: Resonances to start from, as multiples of the observer's bandwidth, and shares of the load. Steps of two are too wide:
+#: between two of them the cost of a resonance that hardly damps has no slope towards either.
+RESONANCES, SHARES = (0.3, 0.42, 0.6, 0.84, 1.2, 1.7, 2.4, 3.4, 4.8, 6.8), (0.3, 0.65)
 
 
-#: Share by which a high command stiffens the spring, to start from.
-BEND = 0.1
+#: Shares by which a high command would stiffen the spring if it stretched as far as a straight one, to start from.
+BENDS = (0.1, 5.0)
 
 
 def terms(scene: SearchContext) -> list[Term]:
     """Many starts: the cost has a valley for each resonance that the excitation holds; and springs that stiffen."""
     grid = [(fast * scene.predictor.rate, share) for fast in RESONANCES for share in SHARES]
     straight = [two_mass_term("joint_elasticity", scene, share, rate) for rate, share in grid]
-    return straight + [two_mass_term("joint_elasticity", scene, share, rate, bend=BEND) for rate, share in grid[::2]]
+    return straight + [
+        two_mass_term("joint_elasticity", scene, share, rate, bend=bend) for bend in BENDS for rate, share in grid[::2]
+    ]
 
 
 EFFECT = Effect(

@@ -10,7 +10,7 @@ from __future__ import annotations
 from servod.lab.diagnose.effects import effect, effects
 from servod.lab.diagnose.effects.base import LEVELS
 from servod.lab.diagnose.effects.hypothesis import PLAINER_FACTOR, Document, Term, get
-from servod.lab.diagnose.select.fit import Fit
+from servod.lab.diagnose.select.fit import Fit, on_bound
 from servod.lab.diagnose.settings import SETTINGS
 
 #: Own numbers of such terms that have no level: damping that fades with speed is judged by the torque that it makes.
@@ -18,16 +18,23 @@ NO_LEVEL = frozenset(("damping_velocity",))
 
 
 def level_at_bound(fit: Fit) -> bool:
-    """Whether a parameter with a level stands on its bound: the data pull it further.
+    """Whether a parameter with a level stands on its bound: the data pull it further."""
+    return bool(_levels_at_bound(fit))
+
+
+def _levels_at_bound(fit: Fit) -> set[str]:
+    """Keys of the parameters with a level that stand on their bound.
 
     The Stribeck velocity has none; it opens together with static friction.
     """
-    low, high = fit.hypothesis.bounds
     watched = LEVELS - {"friction.stribeck_velocity"}
-    indices = [i for i, unknown in enumerate(fit.hypothesis.base) if unknown.key in watched]
-    return any(
-        min(fit.coordinates[i] - low[i], high[i] - fit.coordinates[i]) < SETTINGS.worth.on_bound for i in indices
-    )
+    base = zip(fit.hypothesis.base, on_bound(fit), strict=False)
+    return {unknown.key for unknown, on in base if on and unknown.key in watched}
+
+
+def releases_level(fit: Fit, term: Term) -> bool:
+    """Whether a term opens the bound that a parameter with a level stands on in this fit."""
+    return not _levels_at_bound(fit).isdisjoint(term.opens)
 
 
 def is_level_change(term: Term) -> bool:

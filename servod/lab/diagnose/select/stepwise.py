@@ -7,6 +7,7 @@ behind each term (Efroymson, Multiple regression analysis, 1960), then `swap_ter
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from functools import partial
 from time import monotonic
@@ -23,7 +24,7 @@ from servod.lab.diagnose.select.cross_validation import make_folds, predict_held
 from servod.lab.diagnose.select.fit import Fit
 from servod.lab.diagnose.select.free_windows import free_run_errors
 from servod.lab.diagnose.select.joint import add_levels, add_pair, much_left
-from servod.lab.diagnose.select.levels import is_another, level_at_bound
+from servod.lab.diagnose.select.levels import is_another, level_at_bound, releases_level
 from servod.lab.diagnose.select.merit import Merit
 from servod.lab.diagnose.select.selection import Selection, TermEntry
 from servod.lab.diagnose.select.selector import Selector, is_sound
@@ -64,8 +65,7 @@ def _more_to_find(selector: Selector, selection: Selection) -> bool:
 def _add_best(selector: Selector, selection: Selection) -> Selection:
     """Try all effects beside the present fit and take the best if it deserves it, or two that only together do.
 
-    A fit behind a gap may improve by being fitted again: what a term is worth counts from there. One that has run to
-    the end of its range is none, and sets no bar for the others.
+    A fit behind a gap may improve by being fitted again: what a term is worth counts from there.
     """
     present = selection.fit
     candidates, tried = selector.candidates(present, skip=frozenset(selection.rejected))
@@ -73,13 +73,7 @@ def _add_best(selector: Selector, selection: Selection) -> Selection:
     if (longer := add_levels(selector, selection, candidates)) is not None:
         return longer
     deserves = partial(selector.deserves, selection)
-    best = math.inf
-    for candidate in candidates:
-        if is_another(candidate.fit, candidate.term_index):
-            continue
-        best = min(best, candidate.left)
-        if candidate.left > best + SETTINGS.forward.close * (1.0 - best):
-            break
+    for candidate in worth_trying(present, candidates):
         begun = selector.settle_candidate(candidate, present.mismatch)
         fit, merit = selector.fit_on(selection, present, begun, deserves)
         selection = selector.lower_floor(selection, fit.mismatch)
@@ -94,6 +88,21 @@ def _add_best(selector: Selector, selection: Selection) -> Selection:
             first = selection.minor.get(candidate.effect, merit)
             selection = replace(selection, minor={**selection.minor, candidate.effect: first})
     return add_pair(selector, selection, candidates)
+
+
+def worth_trying(present: Fit, candidates: Iterable[Candidate]) -> Iterator[Candidate]:
+    """Candidates that take nearly what the best takes, and any that releases a level which the data pull on its bound.
+
+    One that has run to the end of its range is none, and sets no bar for the others.
+    """
+    best, close = math.inf, True
+    for candidate in candidates:
+        if is_another(candidate.fit, candidate.term_index):
+            continue
+        best = min(best, candidate.left)
+        close = close and candidate.left <= best + SETTINGS.forward.close * (1.0 - best)
+        if close or releases_level(present, candidate.term):
+            yield candidate
 
 
 def backward_elimination(selector: Selector, selection: Selection) -> Selection:
