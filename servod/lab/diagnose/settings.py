@@ -34,8 +34,10 @@ class IntakeSettings:
     least_steps_warm: float = 3.0
     #: This share of the command's spread counts for dry friction where it is more.
     noise_of_command: float = 0.3
-    #: Share of rows at the end of the command's range from which a recording is refused as saturated.
+    #: Share of rows at the end of the command's range from which a recording is refused as saturated,
     saturated: float = 0.4
+    #: where the motion in them needs so many times what is recorded.
+    needs_more: float = 1.1
     #: The same share from which it is noted.
     noted_saturated: float = 0.02
     #: Share of rows as one of their neighbours from which a command is of steps, and at no limit.
@@ -46,8 +48,6 @@ class IntakeSettings:
     glitch_steps: float = 8.0
     #: Rows of the neighbourhood whose median a glitch leaves.
     neighbourhood: int = 7
-    #: So many names of columns that were not used are listed.
-    names_listed: int = 6
     #: A factor by which a unit is off at least: no model of the right axis is so wrong.
     wrong_unit: float = 5.0
     #: A factor on what moves by which no model is off, whatever else it leaves out: no mass is looked for so far away.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -9,13 +10,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from servod.kernels.laws import LAWS
 from servod.lab.diagnose.data.intake import load_traces
 from servod.lab.diagnose.engine import diagnose
 from servod.lab.diagnose.judge.verdict import below_noise
 from servod.lab.diagnose.predict.predict import Predictor
 from servod.lab.diagnose.result import DiagnosisVerdict
 from servod.lab.recordings import Quantity, Recording
-from tests.lab.diagnose.axes import believed, record, recording
+from servod.lab.simulate.simulate import LoopSettings, simulate_closed_loop
+from tests.lab.diagnose.axes import believed, record, recording, references
 
 Array = NDArray[np.float64]
 
@@ -77,6 +80,19 @@ def test_too_noisy(made: Recording) -> None:
 def test_saturated(made: Recording) -> None:
     most = 0.2 * float(np.median(np.abs(made.torque)))
     assert "saturated" in refused_for(recording(made.t_s, np.clip(made.torque, -most, most), made.position))
+
+
+def test_a_drive_at_its_limit_is_recorded_as_well_as_another() -> None:
+    """A loop that asks for all there is: the command goes from one limit to the other, and the joint by no more."""
+    many, limits = references(5.0)[1], LoopSettings(counts_per_turn=2.0**20, torque_limit_nm=0.3)
+    run = simulate_closed_loop(believed(), LAWS["pd"], (400.0, 9.0, 0.0), many, limits)
+    at_limit = float(np.mean(np.abs(run.torque_nm) == 0.3))
+    assert at_limit > 0.4
+    traces, refused = load_traces([recording(run.t_s, run.torque_nm, run.encoder_rad)], believed())
+    assert refused == []
+    assert traces[0].notes == (f"command: at its limit in {100.0 * at_limit:.0f} % of the rows",)
+    cut = recording(run.t_s, np.clip(run.torque_nm, -0.15, 0.15), run.encoder_rad)
+    assert re.search("and the motion there needs [12][.0-9]* times as much$", refused_for(cut))
 
 
 def test_wrong_sign_and_unit(made: Recording) -> None:

@@ -26,6 +26,9 @@ Array = NDArray[np.float64]
 #: Degrees in a radian.
 DEGREES = 180.0 / math.pi
 
+#: So many names of columns that were not used are listed.
+NAMES_LISTED = 6
+
 
 def load_traces(recordings: Sequence[Recording], model: AxisModel) -> tuple[list[CheckedTrace], list[RefusedRecording]]:
     """Traces of the recordings that can tell, and why the others cannot; names are unique."""
@@ -87,10 +90,9 @@ def _shorten_note(note: str) -> str:
     """A note whose list of names is cut."""
     head, colon, names = note.partition(": ")
     unused = names.split(", ")
-    if not head.startswith("columns not used") or len(unused) <= SETTINGS.intake.names_listed:
+    if not head.startswith("columns not used") or len(unused) <= NAMES_LISTED:
         return note
-    most = SETTINGS.intake.names_listed
-    return f"{head}{colon}{', '.join(unused[:most])} and {len(unused) - most} more"
+    return f"{head}{colon}{', '.join(unused[:NAMES_LISTED])} and {len(unused) - NAMES_LISTED} more"
 
 
 def _temperature_changes(temperature_c: Array) -> bool:
@@ -174,7 +176,7 @@ def refusal_reason(trace: CheckedTrace, model: AxisModel) -> str | None:
     recorded = _too_coarse(trace) or _too_short(trace) or _never_changes(trace)
     moved = _too_noisy(trace, model) or _too_still(trace)
     if trace.drive.told is None:
-        return recorded or wrong_sign_or_unit(trace, model) or moved or _saturated(trace)
+        return recorded or wrong_sign_or_unit(trace, model) or moved or _cut_off(trace, model)
     if model.drive is not None and model.drive.kind.feeds_back:  # a goal has the unit of the position
         return recorded or moved
     return recorded or wrong_sign_or_unit(trace, model) or moved  # what is at the drive's limit is the model's own
@@ -217,11 +219,30 @@ def _never_changes(trace: CheckedTrace) -> str | None:
     return "the command never changes" if float(np.ptp(trace.drive.torque)) == 0.0 else None
 
 
-def _saturated(trace: CheckedTrace) -> str | None:
+def _cut_off(trace: CheckedTrace, model: AxisModel) -> str | None:
+    """Where the command stands at its limit and the motion needs more than that, the record is cut off, not the drive.
+
+    A controller that asks for all that there is moves the joint by no more, and its recording tells as much as another.
+    """
     share = _at_limit(trace.drive.torque)
     if share < SETTINGS.intake.saturated:
         return None
-    return f"saturated: the command stands at its limit in {100.0 * share:.0f} % of the rows"
+    most = float(np.max(np.abs(trace.drive.torque)))
+    at = trace.counts & (np.abs(trace.drive.torque) >= most * (1.0 - 1e-9))
+    needs = float(np.median((np.sign(trace.drive.torque) * _needed(trace, model))[at])) / most
+    if needs < SETTINGS.intake.needs_more:
+        return None
+    return (
+        f"saturated: the command stands at its limit in {100.0 * share:.0f} % of the rows, and the motion there needs "
+        f"{needs:.3g} times as much"
+    )
+
+
+def _needed(trace: CheckedTrace, model: AxisModel) -> Array:
+    """The torque that the model's motion, dry friction and weight need, N*m."""
+    motion, dry, *weight = _known_parts(trace, model)
+    pull = model.gravity.amplitude * weight[0] if model.gravity is not None else 0.0
+    return np.asarray(motion + dry + pull)
 
 
 def _too_noisy(trace: CheckedTrace, model: AxisModel) -> str | None:
@@ -297,22 +318,11 @@ def _position_unit(moved: float, model: AxisModel) -> str | None:
 
 def factors(trace: CheckedTrace, model: AxisModel) -> tuple[Factor, Factor, float]:
     """Factors of motion (inertia and viscous friction) and of dry friction in the command, and the share understood."""
-    x, v = trace.drive.position, trace.velocity
-    rows = trace.counts & np.isfinite(v)
-    slow = max(0.05 * float(np.std(v[rows])), 1e-12)
-    emf = model.drive.back_emf if model.drive is not None and trace.drive.told is not None else 0.0
-    motion = model.inertia * trace.acceleration + (model.friction.viscous + emf) * v
+    x, rows = trace.drive.position, trace.counts & np.isfinite(trace.velocity)
     scaled_position = (x - float(np.mean(x[rows]))) / max(float(np.std(x[rows])), 1e-12)
-    parts = [
-        motion,
-        dry_friction(model) * np.tanh(v / slow),
-        np.ones_like(x),
-        scaled_position,
-        scaled_position**2,
-        scaled_position**3,
-    ]
-    if model.gravity is not None:
-        parts.append(np.sin(x + model.gravity.phase))
+    curve = [np.ones_like(x), scaled_position, scaled_position**2, scaled_position**3]
+    motion, dry, *weight = _known_parts(trace, model)
+    parts = [motion, dry, *curve, *weight]
     design, command = np.column_stack(parts)[rows], trace.drive.torque[rows]
     size = np.maximum(np.sqrt(np.mean(design**2, axis=0)), 1e-30)
     found, *_ = np.linalg.lstsq(design / size, command, rcond=None)
@@ -323,3 +333,15 @@ def factors(trace: CheckedTrace, model: AxisModel) -> tuple[Factor, Factor, floa
     values = found / size
     understood = 1.0 - float(np.var(left)) / max(float(np.var(command)), 1e-30)
     return Factor(float(values[0]), float(errors[0])), Factor(float(values[1]), float(errors[1])), understood
+
+
+def _known_parts(trace: CheckedTrace, model: AxisModel) -> list[Array]:
+    """Torques of the model's inertia and viscous friction, of its dry friction, and how its weight pulls, if any."""
+    v, rows = trace.velocity, trace.counts & np.isfinite(trace.velocity)
+    slow = max(0.05 * float(np.std(v[rows])), 1e-12)
+    emf = model.drive.back_emf if model.drive is not None and trace.drive.told is not None else 0.0
+    motion = model.inertia * trace.acceleration + (model.friction.viscous + emf) * v
+    parts = [motion, dry_friction(model) * np.tanh(v / slow)]
+    if model.gravity is not None:
+        parts.append(np.sin(trace.drive.position + model.gravity.phase))
+    return parts
