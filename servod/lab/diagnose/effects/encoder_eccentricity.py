@@ -28,7 +28,7 @@ def _columns(scene: SearchContext) -> Columns:
 
 
 def terms(scene: SearchContext) -> list[Term]:
-    """One and two periods in a turn, and a searched order, also with its second harmonic: a disc off its axis and oval."""
+    """One and two periods in a turn; a searched order, also with its second harmonic: a disc off its axis and oval."""
     effect, size = "encoder_eccentricity", 1e-3 * scene.reach
     most = 0.1 * scene.reach
     peaks = scene.peaks(_columns(scene), 2)

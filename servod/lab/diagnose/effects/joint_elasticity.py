@@ -9,8 +9,8 @@ from servod.lab.diagnose.effects.looks import Look
 from servod.lab.diagnose.effects.search_context import SearchContext
 from servod.lab.diagnose.effects.two_mass import two_mass_term
 
-#: Resonances to start from, as multiples of the observer's bandwidth, and shares of the load. Steps of two are too wide:
-#: between two of them the cost of a resonance that hardly damps has no slope towards either.
+#: Resonances to start from, as multiples of the observer's bandwidth, and shares of the load. Factors of two are too
+#: wide steps: between two of them the cost of a resonance that hardly damps has no slope towards either.
 RESONANCES, SHARES = (0.3, 0.42, 0.6, 0.84, 1.2, 1.7, 2.4, 3.4, 4.8, 6.8), (0.3, 0.65)
 
 
