@@ -183,7 +183,7 @@ def demo_diagnose(plant: Path, effect: str, fast: bool, out: Path, as_json: bool
     from servod.qualify.demo.recovery.walk import LEAST_RECOVERED, believed_and_true, recover, write_recovery_page
 
     believed, true = believed_and_true(load_rotary_model(plant), effect)
-    need_folder("--out", out)
+    need_folder("--out", out, alone=True)
     begun = time.monotonic()
     with sigterm_as_interrupt(), progress("demo --diagnose", quiet=as_json) as on_progress:
         found = recover(believed, true, effect, stepped_axis if fast else daemon_axis, out, on_progress)

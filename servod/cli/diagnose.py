@@ -63,7 +63,7 @@ def diagnose(
     recorded = [one.between(from_s, to_s) for one in _load(recordings, map_file, axis, model)]
     unseen = _load(hold_out or [], map_file, axis, model)
     need_distinct(recorded, unseen)
-    need_folder("--out", out)
+    need_folder("--out", out, alone=True)
     found = run(axis, recorded, time_limit, _quiet if as_json else _progress, unseen)
     sources: dict[str, Path | list[Path]] = {"model": model, "recordings": recordings, "held out": hold_out or []}
     origin = Origin({**sources, "map": [map_file] if map_file else []})

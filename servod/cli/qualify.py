@@ -59,7 +59,7 @@ def paper(
     from servod.qualify.paper.walk import QUICK, PaperPlan
     from servod.qualify.paper.walk import paper as run
 
-    need_folder("--out", out)
+    need_folder("--out", out, alone=True)
     plan = replace(QUICK if quick else PaperPlan(), seed=seed)
     with progress("paper", quiet=as_json) as on_progress:
         document = run(plan, out, on_progress)

@@ -21,6 +21,7 @@ from servod.lab.commission.state import State
 from servod.runtime.daemon.recorder import RecordingFiles
 from tests.formats.gains import good
 from tests.fuzz.recordings import recorded
+from tests.lab.diagnose.axes import BELIEVED, believed, record, write_csv
 
 
 def test_deploy_announces_no_motion_before_its_inputs_are_checked(
@@ -85,16 +86,25 @@ def test_a_damaged_recording_tells_how_much_could_be_read(
 
 
 def test_a_folder_that_another_command_works_in_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    other = os.open(tmp_path, os.O_RDONLY)
+    out, inputs = tmp_path / "out", tmp_path / "inputs"
+    out.mkdir()
+    inputs.mkdir()
+    other = os.open(out, os.O_RDONLY)
     try:
         fcntl.flock(other, fcntl.LOCK_EX)
+        made = record(believed(), seconds=2.0)[0]
+        write_csv(made, inputs / "run.csv")
+        (inputs / "axis.yaml").write_text(yaml.safe_dump(BELIEVED))
         for command in (
             ["qualify", "soak", "--cycles", "1"],
             ["qualify", "faults", "--stepped"],
+            ["qualify", "paper", "--quick"],
+            ["demo", "--diagnose", "--fast"],
             ["prove", "--cases", "1"],
+            ["diagnose", "--model", str(inputs / "axis.yaml"), str(inputs / "run.csv")],
         ):
-            assert run([*command, "--out", str(tmp_path)]) == 3
-            assert f"--out {tmp_path}: another command is at work there" in capsys.readouterr().err
+            assert run([*command, "--out", str(out)]) == 3
+            assert f"--out {out}: another command is at work there" in capsys.readouterr().err
     finally:
         os.close(other)
     assert not list(tmp_path.iterdir())
