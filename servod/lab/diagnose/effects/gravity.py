@@ -63,7 +63,8 @@ def terms(scene: SearchContext) -> list[Term]:
 
     found = []
     for sine, cosine in starts:
-        unknowns = (share("sine", sine, -most, most, size), share("cosine", cosine, -most, most, size))
+        pulls = (("sine", sine), ("cosine", cosine))
+        unknowns = tuple(share(key, start, -most, most, size, scene.force) for key, start in pulls)
         found.append(Term("gravity", "weight", unknowns, _write, report))
     if scene.reach >= HALF_TURN:
         waves = tuple(

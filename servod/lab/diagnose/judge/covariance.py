@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from servod.lab.diagnose.effects import effect
-from servod.lab.diagnose.effects.base import KNOWN_WITHIN, TORQUES
+from servod.lab.diagnose.effects.base import RECALIBRATION
+from servod.lab.diagnose.select.common_factor import along_factor
 from servod.lab.diagnose.select.fit import Fit, Weighing, covariance, on_bound
 from servod.lab.diagnose.select.selection import HeldOutErrors
 from servod.lab.diagnose.settings import SETTINGS
@@ -58,21 +58,16 @@ def model_error(fit: Fit) -> Array:
 
 
 def common_factor(fit: Fit) -> Array:
-    """With an unknown gain, the common factor on every torque of the axis is as well known as these were beforehand."""
+    """With an unknown gain, the common factor on every torque of the axis is as well known as beforehand.
+
+    A model's numbers come of one identification: what was wrong with its torques is wrong in all of them, and is
+    anything up to what is still recalibration.
+    """
     size = len(fit.coordinates)
-    unknowns = fit.hypothesis.unknowns
-    scaled = np.array([u.key in TORQUES for u in unknowns[: len(fit.hypothesis.base)]])
-    gains = [p for p, term in enumerate(fit.hypothesis.terms) if effect(term.effect).scales_torques]
-    if not gains or not scaled.any():
+    along = along_factor(fit.hypothesis, fit.coordinates)
+    if along is None:
         return np.zeros((size, size))
-    along = np.zeros(size)
-    along[: len(scaled)][scaled] = 1.0
-    for index in gains:
-        along[fit.hypothesis.share(index)] = 1.0
-    known = sum(unknowns[i].spread ** -2.0 for i in np.flatnonzero(scaled))
-    if fit.hypothesis.document["friction"]["kind"] == "local":  # a map is no unknown, and known as well as one
-        known += KNOWN_WITHIN**-2.0
-    return np.asarray(np.outer(along, along) / max(known, 1e-12))
+    return np.asarray(np.outer(along, along) * RECALIBRATION**2 / 3.0)
 
 
 def inside_region(off: Array, spread: Array) -> bool:

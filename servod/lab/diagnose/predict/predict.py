@@ -8,8 +8,9 @@ The torque is that of the command which would close the gap: the pull times the 
 makes of a command. With one mass for all models a trial model k times heavier would shrink every torque that it leaves
 out by k, and mass, gain, saturation and friction of the command would explain anything (the least squares of motion on
 command in place of that of command on motion, which feedback makes biased: Ljung, System Identification, 1999, 13.4).
-A lighter or stronger model is told with the nominal mass: its own would make the encoder's noise small instead. The
-same holds of a drive whose torque is fitted: half the torque of a duty would halve all that a model leaves out.
+A model that is lighter for what it makes of a command is told with the nominal ratio: its own would make the encoder's
+noise small instead. Mass and torque that grow together change neither: no recording tells their common factor. The same
+holds of a drive whose torque is fitted: half the torque of a duty would halve all that a model leaves out.
 """
 
 from __future__ import annotations
@@ -289,9 +290,9 @@ class Predictor:
             SETTINGS.observer.quiet_noises * trace.position_noise,
         )
         self._run(*axis, *held, *gains, starts, states, out)
-        heavier = max((packed.p.inertia + packed.p.load_inertia) / self.inertia, 1.0)
-        weaker = min(torque_per_command(packed.p, trace) * stronger, 1.0)
-        return seen.to_torque * (heavier / weaker) * out
+        heavier = (packed.p.inertia + packed.p.load_inertia) / self.inertia
+        counted = heavier / (torque_per_command(packed.p, trace) * stronger)
+        return seen.to_torque * max(counted, 1.0) * out
 
     def _start(self, packed: PackedPlant, drive: Drive, row: int, known: FirstRow) -> Array:
         """Position, velocity and hidden states in balance with the recorded motion of one row."""

@@ -18,6 +18,7 @@ from pydantic import ValidationError
 from servod.formats.model.axis_model import AxisModel
 from servod.lab.diagnose.effects.hypothesis import Hypothesis
 from servod.lab.diagnose.predict.predict import Predictor, in_parallel
+from servod.lab.diagnose.select.common_factor import believed_factor
 from servod.lab.diagnose.settings import SETTINGS
 
 Array = NDArray[np.float64]
@@ -115,6 +116,9 @@ class Fitter:
         much and no step along it helps, the mismatch is rough: a model that sticks and slips along falling friction
         does so elsewhere after the least change. Then the derivatives are taken over a wider span.
         """
+        return self._as_believed(self._descend(fit, steps, keep_columns, tries, known))
+
+    def _descend(self, fit: Fit, steps: int, keep_columns: int, tries: int, known: int) -> Fit:
         damping, fresh = SETTINGS.fit.least_damping, known <= keep_columns
         jacobian = self.derivatives(fit, max(keep_columns, known))
         for _ in range(steps):
@@ -130,6 +134,15 @@ class Fitter:
             fit = replace(fit, span=SETTINGS.fit.wide) if fresh else fit
             jacobian, fresh, damping = self.derivatives(fit, keep_columns), True, SETTINGS.fit.least_damping
         return fit
+
+    def _as_believed(self, fit: Fit) -> Fit:
+        """The fit with the common factor on all torques as it was believed beforehand, where the data leave it open."""
+        at = believed_factor(fit.hypothesis, fit.coordinates)
+        mismatch = None if at is None else self.mismatch(fit.hypothesis, at)
+        if at is None or mismatch is None:
+            return fit
+        cost = self.cost(fit.hypothesis, at, mismatch)
+        return fit if cost >= fit.cost else replace(fit, coordinates=at, mismatch=mismatch, cost=cost)
 
     def refresh_opened(self, fit: Fit) -> Fit:
         """The fit with fresh columns of its Jacobian for the parameters that its last term opens."""
