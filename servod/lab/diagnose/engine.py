@@ -22,7 +22,13 @@ from servod.lab.diagnose.judge.conclude import (
     reject_terms,
 )
 from servod.lab.diagnose.judge.free_run import judge_held_out
-from servod.lab.diagnose.judge.judgement import JudgedSelection, judge, predicts_nothing, without_names
+from servod.lab.diagnose.judge.judgement import (
+    JudgedSelection,
+    errors_of_names,
+    judge,
+    predicts_nothing,
+    without_names,
+)
 from servod.lab.diagnose.judge.partial import model_without_names, partial_answer
 from servod.lab.diagnose.judge.verdict import below_noise, verdict
 from servod.lab.diagnose.predict.coordinates import units
@@ -110,7 +116,7 @@ def _verdict(judgement: JudgedSelection) -> tuple[DiagnosisVerdict, JudgedSelect
     """The verdict, and the judgement without names where none may stand."""
     predictor, selection = judgement.predictor, judgement.selection
     driven = any(trace.drive.told is not None for trace in predictor.traces)
-    found = verdict(judgement.named, judgement.errors, predictor.dry, driven=driven)
+    found = verdict(judgement.named, errors_of_names(judgement), predictor.dry, driven=driven)
     if found is DiagnosisVerdict.MISSING_PHYSICS and predicts_nothing(judgement):
         found = DiagnosisVerdict.UNEXPLAINED
     if found is DiagnosisVerdict.UNEXPLAINED:

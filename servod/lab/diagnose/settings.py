@@ -46,8 +46,6 @@ class IntakeSettings:
     glitch_noises: float = 30.0
     #: if it is as many usual steps as well: a fast motion is none.
     glitch_steps: float = 8.0
-    #: Rows of the neighbourhood whose median a glitch leaves.
-    neighbourhood: int = 7
     #: A factor by which a unit is off at least: no model of the right axis is so wrong.
     wrong_unit: float = 5.0
     #: A factor on what moves by which no model is off, whatever else it leaves out: no mass is looked for so far away.

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from servod.formats.model.axis_model import AxisModel
-from servod.lab.diagnose.judge.judgement import JudgedSelection, without_names
+from servod.lab.diagnose.judge.judgement import JudgedSelection, errors_of_names, without_names
 from servod.lab.diagnose.judge.partial import best_model, model_without_names, partial_answer
-from servod.lab.diagnose.result import FreeRun, Windows
+from servod.lab.diagnose.judge.verdict import verdict
+from servod.lab.diagnose.result import DiagnosisVerdict, FreeRun, MinorReason, Windows
 from servod.lab.diagnose.select.candidates import Candidate
 from servod.lab.diagnose.select.merit import Merit
 from servod.lab.diagnose.select.selector import Selector
@@ -88,3 +89,18 @@ def test_a_candidate_at_the_end_of_its_range_sets_no_bar(selector: Selector, mon
 def test_a_drift_that_takes_much_of_the_means_needs_less(selector: Selector, taken: float, told: bool) -> None:
     gain = SETTINGS.drift.least_gain_of_most + 1.0 + math.log(float(selector.rows.sum()))
     assert _is_significant(selector, Merit(0.0, 0.0, 0.0, gain), taken) is told
+
+
+@pytest.mark.parametrize(
+    ("why", "found"),
+    [(MinorReason.UNSURE, DiagnosisVerdict.UNEXPLAINED), (MinorReason.LEVEL, DiagnosisVerdict.MISSING_PHYSICS)],
+)
+def test_what_is_not_told_from_none_explains_nothing(
+    selector: Selector, why: MinorReason, found: DiagnosisVerdict
+) -> None:
+    """A resonance on nobody's list was a gap for a quarter, which no interval told from none, and a saturation."""
+    judged = sorted_with(selector, form(selector, "gravity"))
+    merits = (replace(judged.selection.merits[0], share=0.25),)
+    errors = replace(judged.errors, before=1.0, after=0.3, floor=0.01, removed=0.91)
+    judged = replace(judged, selection=replace(judged.selection, merits=merits), errors=errors, kept={0: why})
+    assert verdict((0,), errors_of_names(judged), 20.0) is found

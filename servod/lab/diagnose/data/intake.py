@@ -26,6 +26,9 @@ Array = NDArray[np.float64]
 #: Degrees in a radian.
 DEGREES = 180.0 / math.pi
 
+#: Rows of the neighbourhood whose median a glitch leaves.
+NEIGHBOURHOOD = 7
+
 #: So many names of columns that were not used are listed.
 NAMES_LISTED = 6
 
@@ -139,7 +142,7 @@ def find_glitches(values: Array) -> Rows:
     """Rows that leave the median of their neighbourhood far and alone."""
     from scipy.ndimage import median_filter
 
-    off = np.abs(values - median_filter(values, SETTINGS.intake.neighbourhood, mode="nearest"))
+    off = np.abs(values - median_filter(values, NEIGHBOURHOOD, mode="nearest"))
     step = np.abs(np.diff(values))
     usual = float(np.quantile(step, 0.995)) if len(step) else 0.0
     return np.asarray(

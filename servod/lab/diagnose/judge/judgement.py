@@ -6,6 +6,7 @@ the plain result of it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -167,6 +168,15 @@ def judge(selector: Selector, selection: Selection) -> JudgedSelection:
         maps_before=maps(predictor, base.mismatch),
         maps_after=maps(predictor, fit.mismatch),
     )
+
+
+def errors_of_names(judgement: JudgedSelection) -> Shares:
+    """The errors where what is taken by terms that are not told from none counts as left: they explain nothing."""
+    merits, errors = judgement.selection.merits, judgement.errors
+    unsure = [index for index, why in judgement.kept.items() if why is MinorReason.UNSURE]
+    share = sum(max(merits[index].share, 0.0) for index in unsure)
+    after = errors.after**2 + share * above_noise(errors.before**2, errors.floor**2)
+    return replace(errors, after=math.sqrt(after), removed=max(errors.removed - share, 0.0))
 
 
 def predicts_nothing(judgement: JudgedSelection) -> bool:

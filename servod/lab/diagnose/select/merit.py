@@ -16,6 +16,10 @@ from servod.lab.diagnose.settings import SETTINGS
 Array = NDArray[np.float64]
 
 
+#: What a term whose own torque counts changes at least beside parameters fitted again, as a share of dry friction.
+LEAST_BESIDE = 0.01
+
+
 @dataclass(frozen=True)
 class Merit:
     """What a term is worth: its share of the explainable error, its torque as a share of dry friction, its cost gain.
@@ -33,10 +37,15 @@ class Merit:
 
 
 def worth_naming(merit: Merit, level: bool) -> bool:
-    """Whether a term is worth a name; `level`: it is a parameter of the model's own beyond its level."""
+    """Whether a term is worth a name; `level`: it is a parameter of the model's own beyond its level.
+
+    One that takes blows alone, and leaves all rows between them as they were or worse, is not what they are made of.
+    """
     least = SETTINGS.worth.level_torque if level else SETTINGS.worth.least_torque
-    rest = merit.of_left >= SETTINGS.worth.least_of_left or merit.share >= SETTINGS.worth.sure_share
-    return large_enough(merit, level) and merit.torque >= least and rest
+    much = merit.share >= SETTINGS.worth.sure_share and merit.of_left > 0.0
+    rest = merit.of_left >= SETTINGS.worth.least_of_left or much
+    acts = merit.torque >= (min(least, LEAST_BESIDE) if _own_counts(merit) else least)
+    return large_enough(merit, level) and acts and rest
 
 
 def large_enough(merit: Merit, level: bool) -> bool:
@@ -45,6 +54,11 @@ def large_enough(merit: Merit, level: bool) -> bool:
         SETTINGS.worth.level_torque if level else SETTINGS.worth.torque
     ):
         return True
+    return _own_counts(merit)
+
+
+def _own_counts(merit: Merit) -> bool:
+    """Whether the torque that a term stands for counts, not what it changes beside parameters fitted again."""
     return merit.own >= SETTINGS.worth.torque and merit.of_left >= SETTINGS.worth.nearly_all
 
 
