@@ -105,7 +105,7 @@ class Fitter:
     def predicted_cost(self, fit: Fit) -> float:
         """The cost after one step along the columns of the Jacobian that are known, by the Jacobian alone."""
         columns = fit.jacobian.shape[1]
-        normal, slope = self._normal(fit, fit.jacobian)
+        normal, slope = self.normal(fit, fit.jacobian)
         return fit.cost - 0.5 * float(slope @ np.linalg.solve(normal + 1e-9 * np.eye(columns), slope))
 
     def refine(self, fit: Fit, steps: int, keep_columns: int = 0, tries: int = 4, known: int = 0) -> Fit:
@@ -172,7 +172,7 @@ class Fitter:
 
     def _step(self, fit: Fit, jacobian: Array, damping: float, tries: int) -> tuple[Fit, float]:
         """One damped step that lowers the cost; the fit itself when none does."""
-        normal, slope = self._normal(fit, jacobian)
+        normal, slope = self.normal(fit, jacobian)
         for _ in range(tries):
             change = _bounded_step(normal, slope, damping, fit)
             at = fit.coordinates + change
@@ -187,11 +187,11 @@ class Fitter:
 
     def _predicted_gain(self, fit: Fit, jacobian: Array) -> float:
         """The share of the cost that one step would take if the mismatch were straight along the Jacobian."""
-        normal, slope = self._normal(fit, jacobian)
+        normal, slope = self.normal(fit, jacobian)
         change = _bounded_step(normal, slope, SETTINGS.fit.least_damping, fit)
         return -float(slope @ change + 0.5 * change @ normal @ change) / max(fit.cost, 1.0)
 
-    def _normal(self, fit: Fit, jacobian: Array) -> tuple[Array, Array]:
+    def normal(self, fit: Fit, jacobian: Array) -> tuple[Array, Array]:
         """Normal matrix and slope of the cost, prior included."""
         off = np.abs(fit.mismatch) / self.weighing.scale
         weight = self.weighing.rows * np.minimum(1.0, SETTINGS.fit.huber / np.maximum(off, 1e-12))

@@ -27,6 +27,7 @@ from servod.lab.diagnose.select.fit import Fit, Fitter, Weighing, long_run, scal
 from servod.lab.diagnose.select.levels import is_another, is_level_change
 from servod.lab.diagnose.select.merit import Merit, acting_torque, worth_naming
 from servod.lab.diagnose.select.selection import Selection
+from servod.lab.diagnose.select.valley import follow
 from servod.lab.diagnose.settings import SETTINGS
 
 Array = NDArray[np.float64]
@@ -81,13 +82,22 @@ class Selector:
         return self.lower_floor(replace(selection, base=base, fit=fit, base_error=error, floor=floor), fit.mismatch)
 
     def polished(self, fit: Fit) -> Fit:
-        """A fit fitted on along derivatives over wide spans, then over less wide ones; its Jacobian is fresh."""
+        """A fit fitted on along derivatives over wide spans, then less wide ones, then along its valley.
+
+        Its Jacobian is fresh.
+        """
         begun = self.fitter(fit.mismatch).begin(fit.hypothesis, fit.coordinates)
         if begun is None:
             raise ValueError("a fit that makes no sense")
         for span in SPANS:
             begun = self._refined(replace(begun, span=span), begun.mismatch, 0)
-        return self.refresh(replace(begun, span=max(fit.span, SETTINGS.fit.wide)))
+        return self.refresh(self._along_valley(replace(begun, span=max(fit.span, SETTINGS.fit.wide))))
+
+    def _along_valley(self, fit: Fit) -> Fit:
+        """A fit moved to the bottom of its valley, in the scale of its own mismatch."""
+        fitter = self.fitter(fit.mismatch)
+        begun = replace(fit, cost=fitter.cost(fit.hypothesis, fit.coordinates, fit.mismatch))
+        return follow(fitter, lambda moved: fitter.refine(replace(moved, converged=False), SETTINGS.fit.steps), begun)
 
     def fitter(self, mismatch: Array) -> Fitter:
         """A fitter that counts costs in the scale of this mismatch."""

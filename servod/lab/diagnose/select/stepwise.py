@@ -151,13 +151,18 @@ def judged_again(selector: Selector, selection: Selection) -> Selection:
 
 def _swap(selector: Selector, selection: Selection, index: int, rival: Candidate) -> Selection | None:
     """The selection with a rival in the place of a term, if it does better there and deserves to come in."""
-    last, near = index == selection.terms - 1, rival.left <= SETTINGS.swap.near * selection.entries[index].left
-    if last and not near:
+    last, left = index == selection.terms - 1, selection.entries[index].left
+    near, nothing = rival.left <= SETTINGS.swap.near * left, rival.left <= left + SETTINGS.joint.nothing
+    if last and not (near or nothing):
         return None
     fit = _instead(selector, selection.fit, index, rival)
     if fit is None:
         return None
-    better = not last and _better(selector, selection.fit, fit)
+    if last and nothing:  # both left next to nothing at first: which leaves less, their best fits say
+        present, fit = selector.polished(selection.fit), selector.polished(fit)
+        better = _better(selector, present, fit)
+    else:
+        better = not last and _better(selector, selection.fit, fit)
     if not better and not (near and _cost_ratio(selector, selection.fit, fit) <= SETTINGS.swap.near):
         return None
     merit = selector.merit(selection, selector.settle_without(fit, index), fit)
