@@ -84,6 +84,11 @@ def test_a_common_factor_is_none_of_mass_and_all_friction_beside_a_weight() -> N
     assert {one["effect"] for one in found["findings"]} == {"gravity", "torque_gain"}
 
 
+def test_beside_a_gain_half_of_everything_is_no_stiffer_bristle() -> None:
+    found = diagnosed(axis(more={"torque_gain": {"factor": 0.8}}, sigma0=3.0))
+    assert {one["effect"] for one in found["findings"]} == {"torque_gain", "presliding"}
+
+
 @pytest.mark.parametrize(("deviation", "told"), [(0.2, True), (0.6, False)])
 def test_a_level_whose_interval_holds_the_models_own_is_no_finding(deviation: float, told: bool) -> None:
     """Nor is any term none of whose numbers is told from none by itself."""

@@ -13,7 +13,7 @@ from dataclasses import replace
 from time import monotonic
 from typing import NamedTuple
 
-from servod.lab.diagnose.effects import effects
+from servod.lab.diagnose.effects import effect, effects
 from servod.lab.diagnose.effects.hypothesis import Term
 from servod.lab.diagnose.effects.search_context import SearchContext
 from servod.lab.diagnose.predict.floor import above_noise
@@ -51,12 +51,13 @@ def add_levels(selector: Selector, selection: Selection, candidates: Sequence[Ca
 def _released(selector: Selector, selection: Selection) -> Fit:
     """The present fit with every level released that may be, and is not yet.
 
-    One whose bounds a term opens, such as the mass, is where what was released before leaves it on its bound.
+    One whose bounds a term opens, such as the mass, is where what was released before leaves it on its bound. Beside a
+    gain none: nothing would hold their common factor, and half of everything is a bristle of twice the stiffness.
     """
     fit = selection.fit
     scene = SearchContext(selector.start.document, selector.predictor, fit.mismatch)
     out = {term.effect for term in fit.hypothesis.terms} | set(selection.rejected) | selector.untried
-    if scene.servo:
+    if scene.servo or any(effect(term.effect).scales_torques for term in fit.hypothesis.terms):
         return fit
     terms = [what.terms(scene)[:1] for what in effects() if what.jointly and what.name not in out]
     for term in sorted((term for first in terms for term in first), key=lambda term: bool(term.opens)):
