@@ -97,7 +97,11 @@ class Selector:
         """A fit moved to the bottom of its valley, in the scale of its own mismatch."""
         fitter = self.fitter(fit.mismatch)
         begun = replace(fit, cost=fitter.cost(fit.hypothesis, fit.coordinates, fit.mismatch))
-        return follow(fitter, lambda moved: fitter.refine(replace(moved, converged=False), SETTINGS.fit.steps), begun)
+
+        def refine(moved: Fit) -> Fit:
+            return fitter.refine(replace(moved, converged=False), SETTINGS.fit.steps)
+
+        return follow(fitter, refine, begun, self.deadline)
 
     def fitter(self, mismatch: Array) -> Fitter:
         """A fitter that counts costs in the scale of this mismatch."""

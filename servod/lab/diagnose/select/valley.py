@@ -9,8 +9,10 @@ the ACM 8, 1961).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
+from time import monotonic
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,9 +29,14 @@ ROUNDS, LEAST_GAIN, DOUBLINGS = 8, 5e-4, 8
 FIRSTS = (2.0, 0.4, 0.08)
 
 
-def follow(fitter: Fitter, refine: Callable[[Fit], Fit], fit: Fit) -> Fit:
-    """The fit moved along its valley while that gains enough; `refine` fits all numbers in the scale of `fitter`."""
+def follow(fitter: Fitter, refine: Callable[[Fit], Fit], fit: Fit, deadline: float = math.inf) -> Fit:
+    """The fit moved along its valley while that gains enough, and until the monotonic time `deadline`.
+
+    `refine` fits all numbers in the scale of `fitter`.
+    """
     for _ in range(ROUNDS):
+        if monotonic() > deadline:
+            break
         jacobian = fitter.derivatives(fit)
         moved = _begin(fitter, fit, _least_curved(fitter, fit, jacobian))
         if moved is None:
