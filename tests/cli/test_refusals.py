@@ -107,7 +107,7 @@ def test_a_folder_that_another_command_works_in_is_refused(tmp_path: Path, capsy
             assert f"--out {out}: another command is at work there" in capsys.readouterr().err
     finally:
         os.close(other)
-    assert not list(tmp_path.iterdir())
+    assert not list(out.iterdir())
 
 
 def _hang_up(listening: socket.socket) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from time import monotonic
 from types import SimpleNamespace
 from typing import Any, cast
@@ -56,7 +57,7 @@ class RoughSelector(Selector):
     """A selector of one rough mismatch, whatever the recordings."""
 
     def __init__(self, rough: RoughFitter) -> None:
-        self._rough = rough
+        self._rough, self.deadline = rough, math.inf
 
     def fitter(self, _mismatch: Array) -> RoughFitter:
         return self._rough

@@ -7,8 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from servod.lab.diagnose.effects.hypothesis import Hypothesis, Unknown
-from servod.lab.diagnose.select.fit import Fit, Fitter, Weighing
-from servod.lab.diagnose.select.valley import follow
+from servod.lab.diagnose.select.fit import Fit, Fitter, Weighing, follow
 
 Array = NDArray[np.float64]
 

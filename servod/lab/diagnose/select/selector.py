@@ -23,11 +23,10 @@ from servod.lab.diagnose.effects.search_context import SearchContext
 from servod.lab.diagnose.predict.floor import above_noise, noise_floor, stretch_means
 from servod.lab.diagnose.predict.predict import Predictor, fine_step_s, shorten
 from servod.lab.diagnose.select.candidates import Candidate, CandidateFits
-from servod.lab.diagnose.select.fit import Fit, Fitter, Weighing, long_run, scale_of
+from servod.lab.diagnose.select.fit import Fit, Fitter, Weighing, follow, long_run, scale_of
 from servod.lab.diagnose.select.levels import is_another, is_level_change
 from servod.lab.diagnose.select.merit import Merit, acting_torque, worth_naming
 from servod.lab.diagnose.select.selection import Selection
-from servod.lab.diagnose.select.valley import follow
 from servod.lab.diagnose.settings import SETTINGS
 
 Array = NDArray[np.float64]
