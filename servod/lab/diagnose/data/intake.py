@@ -231,8 +231,9 @@ def _cut_off(trace: CheckedTrace, model: AxisModel) -> str | None:
     if share < SETTINGS.intake.saturated:
         return None
     most = float(np.max(np.abs(trace.drive.torque)))
-    at = trace.counts & (np.abs(trace.drive.torque) >= most * (1.0 - 1e-9))
-    needs = float(np.median((np.sign(trace.drive.torque) * _needed(trace, model))[at])) / most
+    needed = np.sign(trace.drive.torque) * _needed(trace, model)
+    at = trace.counts & np.isfinite(needed) & (np.abs(trace.drive.torque) >= most * (1.0 - 1e-9))
+    needs = float(np.median(needed[at])) / most if at.any() else math.inf
     if needs < SETTINGS.intake.needs_more:
         return None
     return (
